@@ -1,0 +1,2 @@
+//! ignctl.
+fn main() {}

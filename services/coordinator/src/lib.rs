@@ -1,0 +1,1 @@
+//! Coordinator: gRPC control plane and HTTP data plane on one port.

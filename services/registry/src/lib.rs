@@ -1,0 +1,1 @@
+//! Content-addressed blobs, manifests, versions and aliases on an object store.

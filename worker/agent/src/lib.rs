@@ -1,0 +1,1 @@
+//! Worker agent: lease, heartbeat, transfer, and supervision of one child process per job.

@@ -1,0 +1,1 @@
+//! Plan, train, evaluate and report one object.

@@ -1,0 +1,1 @@
+//! The bundle manifest ign.bundle/1: pack, verify, read.

@@ -1,0 +1,1 @@
+//! Importers, images, masks, preflight and the held-out split.

@@ -1,0 +1,1 @@
+//! Ray-traced demo captures with ground truth.

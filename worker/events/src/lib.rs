@@ -1,0 +1,92 @@
+//! Typed events from a bake to whoever watches it.
+//!
+//! A bake (`ign-bake`) emits [`Event`]s; `ign-worker exec` writes each as one JSON line on stdout; the agent
+//! (`ign-agent`) reads them, forwards progress and logs, and uploads checkpoints and results. Both sides of that
+//! pipe use this crate, so its serde form is the contract between them.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+/// One line from a bake.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// How far the whole bake is.
+    Progress(Progress),
+    /// A line for the job's log.
+    Log {
+        /// Severity.
+        level: Level,
+        /// One sentence, lowercase, no full stop.
+        message: String,
+    },
+    /// A checkpoint file was written and closed; training can resume from it.
+    Checkpoint {
+        /// Absolute path of the file; it is not changed afterwards.
+        path: PathBuf,
+    },
+    /// The bake ended well.
+    Done {
+        /// Folder that holds the bundle's files.
+        bundle: PathBuf,
+    },
+    /// The bake ended without a result.
+    Failed(Failure),
+}
+
+/// How far a bake is.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// `import`, `plan`, `effects`, `composition`, `evaluate` or `pack`.
+    pub stage: String,
+    /// Of the whole bake, 0 to 100.
+    pub percent: f64,
+    /// Seconds left, when known.
+    pub eta_secs: Option<f64>,
+    /// Current validation error (full-frame MSE on [0, 255]), where the stage has one.
+    pub error: Option<f64>,
+    /// What is being done, for people.
+    pub message: String,
+}
+
+/// Severity of a log line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Level {
+    /// Ordinary.
+    Info,
+    /// Something the user should look at.
+    Warn,
+    /// Something that ended the attempt.
+    Error,
+}
+
+/// Why a bake ended without a result.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failure {
+    /// Decides whether it is tried again.
+    pub kind: FailureKind,
+    /// What, lowercase, no full stop.
+    pub message: String,
+    /// Where: file and line, or the view's name; may be empty.
+    #[serde(default)]
+    pub at: String,
+    /// How to fix it; may be empty.
+    #[serde(default)]
+    pub hint: String,
+}
+
+/// Class of a failure; decides whether the job is tried again.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FailureKind {
+    /// May go away by itself: network, store, full disk. Retried.
+    Transient,
+    /// The capture or recipe is wrong. Not retried.
+    InvalidInput,
+    /// Panic, abort or out of memory. Retried.
+    Crashed,
+    /// Stopped on request.
+    Cancelled,
+}

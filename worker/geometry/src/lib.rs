@@ -1,0 +1,1 @@
+//! Cameras, meshes, rasteriser, G-buffers, cross-projection and coverage, in f64.

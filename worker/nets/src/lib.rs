@@ -1,0 +1,1 @@
+//! EffectsNet, CompositionNet, PatchGAN, warps, losses and the optimiser.

@@ -1,0 +1,1 @@
+//! From a bundle and a camera to an image; the image-based baselines.
