@@ -4,9 +4,13 @@
 //! (`ign-agent`) reads them, forwards progress and logs, and uploads checkpoints and results. Both sides of that
 //! pipe use this crate, so its serde form is the contract between them.
 
+mod job;
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+
+pub use job::{JobFile, ObjectName};
 
 /// One line from a bake.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -33,6 +37,21 @@ pub enum Event {
     },
     /// The bake ended without a result.
     Failed(Failure),
+}
+
+impl Event {
+    /// The event as one line of JSON, without the line break.
+    ///
+    /// # Errors
+    /// A path in the event is not Unicode.
+    pub fn to_line(&self) -> serde_json::Result<String> {
+        serde_json::to_string(self)
+    }
+
+    /// Reads one line of a child's stdout; `None` when it is something else that was printed there.
+    pub fn from_line(line: &str) -> Option<Self> {
+        serde_json::from_str(line).ok()
+    }
 }
 
 /// How far a bake is.
@@ -89,4 +108,59 @@ pub enum FailureKind {
     Crashed,
     /// Stopped on request.
     Cancelled,
+}
+
+impl std::fmt::Display for Failure {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.message)?;
+        if !self.at.is_empty() {
+            write!(f, " (at {})", self.at)?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_keep_their_form() {
+        let event = Event::Checkpoint {
+            path: PathBuf::from("/w/c.bin"),
+        };
+        let line = event.to_line().unwrap();
+        assert_eq!(line, r#"{"event":"checkpoint","path":"/w/c.bin"}"#);
+        assert_eq!(Event::from_line(&line), Some(event));
+        let failed = r#"{"event":"failed","kind":"invalid_input","message":"camera 3 has zero focal length"}"#;
+        let Some(Event::Failed(failure)) = Event::from_line(failed) else {
+            panic!("not read: {failed}")
+        };
+        assert_eq!(failure.kind, FailureKind::InvalidInput);
+        assert_eq!(failure.at, "");
+    }
+
+    #[test]
+    fn other_output_is_no_event() {
+        for line in ["", "Epoch 3", "{}", r#"{"event":"sing"}"#, "{\"event\":"] {
+            assert_eq!(Event::from_line(line), None, "{line}");
+        }
+    }
+
+    #[test]
+    fn nan_in_progress_survives_as_unknown() {
+        let line = Event::Progress(Progress {
+            stage: "plan".into(),
+            percent: 1.0,
+            eta_secs: None,
+            error: Some(f64::NAN),
+            message: String::new(),
+        })
+        .to_line()
+        .unwrap();
+        let Some(Event::Progress(progress)) = Event::from_line(&line) else {
+            panic!("not read: {line}")
+        };
+        assert_eq!(progress.error, None);
+    }
 }
