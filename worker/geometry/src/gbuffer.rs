@@ -1,0 +1,254 @@
+//! G-buffers: what the proxy looks like from a camera, as the maps that the networks read (paper, Sec. `EffectsNet`,
+//! "Network Inputs": position, normals, reflected viewing direction).
+
+use glam::{DVec2, DVec3};
+use rayon::prelude::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+
+use crate::raster::{Projected, clear, keep_nearest, key_triangle};
+use crate::{Camera, Mesh};
+
+/// Maps of one view, row-major, `height * width` entries each. Outside `mask` everything is zero.
+///
+/// Positions are f32 and meant for the normalised frame (bounding sphere of radius 1); normalise mesh and camera
+/// first.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GBuffer {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// The camera it was rendered with.
+    pub camera: Camera,
+    /// Share of each pixel that the mesh covers, in [0, 1].
+    pub coverage: Vec<f32>,
+    /// Whether the pixel is covered at all: `coverage > 0`.
+    pub mask: Vec<bool>,
+    /// Camera z.
+    pub depth: Vec<f32>,
+    /// World position.
+    pub position: Vec<[f32; 3]>,
+    /// Interpolated normal in world axes, unit, never pointing away from the camera.
+    pub normal: Vec<[f32; 3]>,
+    /// Normal by finite differences of `position`, as in the paper; unit, never pointing away from the camera.
+    /// Where a pixel has no covered neighbours across or along, the interpolated one.
+    pub normal_fd: Vec<[f32; 3]>,
+    /// Direction, in world axes, in which the viewing ray leaves the surface when reflected about `normal`; unit.
+    pub reflection: Vec<[f32; 3]>,
+}
+
+/// One pixel while it is drawn.
+#[derive(Clone, Copy, Default)]
+struct Pixel {
+    coverage: f32,
+    depth: f32,
+    position: [f32; 3],
+    normal: [f32; 3],
+    reflection: [f32; 3],
+}
+
+impl GBuffer {
+    /// Draws `mesh` with `samples` x `samples` samples a pixel (0 counts as 1).
+    ///
+    /// Coverage is the covered share of the samples. The attributes are those of the pixel's centre where the mesh
+    /// covers it, so that a map is not shifted by a part of a pixel, and otherwise (in the silhouette's rim) those
+    /// of the covered sample nearest to it.
+    pub fn render(mesh: &Mesh, camera: &Camera, samples: u32) -> Self {
+        let (width, height) = (
+            camera.intrinsics.width as usize,
+            camera.intrinsics.height as usize,
+        );
+        let samples = samples.max(1) as usize;
+        // With an odd number of samples one of them is the centre.
+        let grids: &[usize] = if samples % 2 == 1 {
+            &[samples]
+        } else {
+            &[samples, 1]
+        };
+        let scene = Projected::new(mesh, camera);
+        let bins = scene.bin(width, height, grids);
+        let order = samples_by_distance(samples);
+        let eye = camera.center();
+        let mut pixels = vec![Pixel::default(); width * height];
+        bins.bands(&mut pixels, width).for_each_init(
+            || (Vec::new(), Vec::new()),
+            |(keys, centers), (band, pixels)| {
+                let rows = bins.rows(band);
+                let row_samples = width * samples;
+                clear(keys, pixels.len() * samples * samples);
+                clear(centers, pixels.len());
+                bins.for_each_triangle(band, |triangle| {
+                    for piece in scene.pieces(triangle) {
+                        piece.scan(
+                            samples,
+                            width,
+                            rows.clone(),
+                            |row, column, inverse_depth| {
+                                let key =
+                                    &mut keys[(row - rows.start * samples) * row_samples + column];
+                                keep_nearest(key, inverse_depth, triangle);
+                            },
+                        );
+                        if grids.len() > 1 {
+                            piece.scan(1, width, rows.clone(), |row, column, inverse_depth| {
+                                keep_nearest(
+                                    &mut centers[(row - rows.start) * width + column],
+                                    inverse_depth,
+                                    triangle,
+                                );
+                            });
+                        }
+                    }
+                });
+                for (index, pixel) in pixels.iter_mut().enumerate() {
+                    let (row, column) = (index / width, index % width);
+                    let corner = row * samples * row_samples + column * samples;
+                    let key = |(x, y): (usize, usize)| keys[corner + y * row_samples + x];
+                    let count = order
+                        .iter()
+                        .filter(|sample| key_triangle(key(**sample)).is_some())
+                        .count();
+                    if count == 0 {
+                        continue;
+                    }
+                    let corner = DVec2::new(column as f64, (rows.start + row) as f64);
+                    let center =
+                        key_triangle(centers[index]).map(|triangle| (triangle, DVec2::splat(0.5)));
+                    let nearest = center.or_else(|| {
+                        let sample = order
+                            .iter()
+                            .find(|sample| key_triangle(key(**sample)).is_some())?;
+                        let offset = DVec2::new(sample.0 as f64 + 0.5, sample.1 as f64 + 0.5)
+                            / samples as f64;
+                        Some((key_triangle(key(*sample))?, offset))
+                    });
+                    if let Some((triangle, offset)) = nearest
+                        && let Some(attributes) =
+                            attributes(mesh, &scene, triangle, corner + offset, eye)
+                    {
+                        *pixel = Pixel {
+                            coverage: count as f32 / (samples * samples) as f32,
+                            ..attributes
+                        };
+                    }
+                }
+            },
+        );
+        let mask: Vec<bool> = pixels.iter().map(|pixel| pixel.coverage > 0.0).collect();
+        let normal_fd = normals_by_differences(&pixels, &mask, width, eye);
+        Self {
+            width: width as u32,
+            height: height as u32,
+            camera: *camera,
+            coverage: pixels.iter().map(|pixel| pixel.coverage).collect(),
+            depth: pixels.iter().map(|pixel| pixel.depth).collect(),
+            position: pixels.iter().map(|pixel| pixel.position).collect(),
+            normal: pixels.iter().map(|pixel| pixel.normal).collect(),
+            reflection: pixels.iter().map(|pixel| pixel.reflection).collect(),
+            mask,
+            normal_fd,
+        }
+    }
+}
+
+/// Samples of a pixel, the one nearest to the centre first; equally near ones in reading order.
+fn samples_by_distance(samples: usize) -> Vec<(usize, usize)> {
+    let mut order: Vec<(usize, usize)> = (0..samples * samples)
+        .map(|index| (index % samples, index / samples))
+        .collect();
+    let off_center = |index: usize| (2 * index + 1).abs_diff(samples).pow(2);
+    order.sort_by_key(|&(x, y)| off_center(x) + off_center(y));
+    order
+}
+
+/// Surface attributes where the ray through `px` meets `triangle`.
+fn attributes(
+    mesh: &Mesh,
+    scene: &Projected<'_>,
+    triangle: u32,
+    px: DVec2,
+    eye: DVec3,
+) -> Option<Pixel> {
+    let (weights, depth) = scene.surface(triangle, px)?;
+    let corners = mesh.triangles[triangle as usize].map(|corner| corner as usize);
+    let [a, b, c] = corners.map(|corner| mesh.positions[corner]);
+    let position = a * weights[0] + b * weights[1] + c * weights[2];
+    let view = (position - eye).try_normalize()?;
+    let face = (b - a).cross(c - a);
+    let face = if face.dot(view) > 0.0 { -face } else { face };
+    let normal = corners
+        .iter()
+        .zip(weights)
+        .map(|(corner, weight)| mesh.normals.get(*corner).copied().unwrap_or_default() * weight)
+        .sum::<DVec3>();
+    // The side is the face's; an interpolated normal alone would flip in the middle of a silhouette's triangle.
+    let normal = if normal.dot(face) < 0.0 {
+        -normal
+    } else {
+        normal
+    };
+    let normal = facing(normal, view)
+        .or_else(|| facing(face, view))
+        .unwrap_or(-view);
+    let reflection = view - normal * (2.0 * view.dot(normal));
+    Some(Pixel {
+        coverage: 0.0,
+        depth: depth as f32,
+        position: position.as_vec3().to_array(),
+        normal: normal.as_vec3().to_array(),
+        reflection: reflection.as_vec3().to_array(),
+    })
+}
+
+/// Unit vector along `normal`, tilted just so far that it does not point away along the viewing direction.
+fn facing(normal: DVec3, view: DVec3) -> Option<DVec3> {
+    let normal = normal.try_normalize()?;
+    let away = normal.dot(view);
+    if away <= 0.0 {
+        Some(normal)
+    } else {
+        (normal - view * away).try_normalize()
+    }
+}
+
+/// Normals from differences of neighbouring positions: central where both neighbours are covered, else one-sided.
+fn normals_by_differences(
+    pixels: &[Pixel],
+    mask: &[bool],
+    width: usize,
+    eye: DVec3,
+) -> Vec<[f32; 3]> {
+    let mut normals = vec![[0.0_f32; 3]; pixels.len()];
+    let position = |index: usize| glam::Vec3::from(pixels[index].position).as_dvec3();
+    let covered = |index: Option<usize>| {
+        index.filter(|index| mask.get(*index).is_some_and(|covered| *covered))
+    };
+    normals
+        .par_iter_mut()
+        .enumerate()
+        .filter(|(index, _)| mask[*index])
+        .for_each(|(index, normal)| {
+            let column = index % width;
+            let difference = |before: Option<usize>, after: Option<usize>| {
+                let (before, after) = (
+                    covered(before).unwrap_or(index),
+                    covered(after).unwrap_or(index),
+                );
+                position(after) - position(before)
+            };
+            let across = difference(
+                index.checked_sub(1).filter(|_| column > 0),
+                Some(index + 1).filter(|_| column + 1 < width),
+            );
+            let along = difference(index.checked_sub(width), Some(index + width));
+            let view = (position(index) - eye).normalize_or_zero();
+            let vector = along.cross(across);
+            let vector = if vector.dot(view) > 0.0 {
+                -vector
+            } else {
+                vector
+            };
+            *normal = facing(vector, view)
+                .map_or(pixels[index].normal, |normal| normal.as_vec3().to_array());
+        });
+    normals
+}
