@@ -7,6 +7,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 use uuid::Uuid;
 
 use crate::v1;
@@ -127,7 +128,22 @@ text_id!(
     })
 );
 
+text_id!(
+    /// Path of a file inside a capture or bundle, relative, with `/`: joined to any folder, it stays inside it.
+    FilePath,
+    "path",
+    "relative, with / between names, no empty, . or .. name, no \\ : or control character, at most 512 bytes",
+    |text| text.len() <= 512
+        && !text.chars().any(|c| c.is_control() || matches!(c, '\\' | ':'))
+        && text.split('/').all(|name| !matches!(name, "" | "." | ".."))
+);
+
 impl Digest {
+    /// Of bytes in memory.
+    pub fn of(bytes: &[u8]) -> Self {
+        Self::from_sha256(Sha256::digest(bytes).into())
+    }
+
     /// From the 32 bytes that SHA-256 gave.
     pub fn from_sha256(hash: [u8; 32]) -> Self {
         use fmt::Write as _;
@@ -293,11 +309,45 @@ mod tests {
     }
 
     #[test]
+    fn file_paths_cannot_leave_their_folder() {
+        for good in [
+            "a",
+            "images/0001 (copy).JPG",
+            "sparse/0/cameras.bin",
+            "ä/ö",
+            "..a/b..",
+            ".hidden",
+        ] {
+            assert!(good.parse::<FilePath>().is_ok(), "{good}");
+        }
+        for bad in [
+            "",
+            "/",
+            "/a",
+            "a/",
+            "a//b",
+            ".",
+            "..",
+            "a/../b",
+            "./a",
+            "a\\b",
+            "C:a",
+            "a\0",
+            "a\n",
+            &"x".repeat(513),
+        ] {
+            assert!(bad.parse::<FilePath>().is_err(), "{bad:?}");
+        }
+    }
+
+    #[test]
     fn digest_round_trips_and_refuses_other_spellings() {
         let digest = Digest::from_sha256([0xAB; 32]);
         assert_eq!(digest.as_str(), format!("sha256:{}", "ab".repeat(32)));
         assert_eq!(digest.to_string().parse::<Digest>().unwrap(), digest);
         assert_eq!(digest.hex().len(), 64);
+        let empty = "sha256:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855";
+        assert_eq!(Digest::of(b"").as_str(), empty);
         for bad in [
             "ab".repeat(32),
             format!("sha256:{}", "AB".repeat(32)),

@@ -2,14 +2,19 @@
 //!
 //! - [`v1`]: messages, clients and servers generated from `ign/v1/ign.proto`.
 //! - [`ids`]: newtypes for names and digests; a value that exists is valid.
+//! - [`manifest`]: captures and bundles as OCI image manifests, written and read.
 //! - [`status`]: the one place that builds or reads a [`tonic::Status`].
 //!
 //! Invariant: this crate does no I/O and knows nothing of stores or jobs' rules.
 
 pub mod ids;
+pub mod manifest;
 pub mod status;
 
-pub use ids::{Attempt, CollectionId, Digest, IdError, JobId, ObjectId, ObjectName, WorkerId};
+pub use ids::{
+    Attempt, CollectionId, Digest, FilePath, IdError, JobId, ObjectId, ObjectName, WorkerId,
+};
+pub use manifest::{FileEntry, Kind, Manifest};
 pub use status::Cause;
 
 /// Messages, clients and servers generated from `ign/v1/ign.proto`.
@@ -31,9 +36,3 @@ pub mod v1 {
 
 /// Largest gRPC message that either side accepts. Bytes of captures and bundles travel over HTTP instead.
 pub const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
-
-/// Media type of a capture manifest (`artifactType`).
-pub const CAPTURE_TYPE: &str = "application/vnd.ign.capture.v1";
-
-/// Media type of a bundle manifest (`artifactType`).
-pub const BUNDLE_TYPE: &str = "application/vnd.ign.bundle.v1";
