@@ -1,0 +1,97 @@
+//! What an import yields.
+
+use std::path::PathBuf;
+
+use glam::DVec3;
+use ign_geometry::{Camera, Mesh};
+use serde::{Deserialize, Serialize};
+
+use crate::distortion::SourceCamera;
+use crate::fault::Fault;
+use crate::frame::Bounds;
+
+/// A capture that can be worked with: every file it names was there and of the right size.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// Name of the object or, where `capture.toml` has none, of the folder.
+    pub name: String,
+    /// What the capture says about itself.
+    pub info: CaptureInfo,
+    /// The proxy, in the frame of the COLMAP model ("world").
+    pub mesh: Mesh,
+    /// All views that see the proxy, in path order.
+    pub views: Vec<View>,
+    /// Indices of the views to train on, ascending.
+    pub train: Vec<usize>,
+    /// Indices of the views that are only ever compared with, ascending; disjoint from `train`.
+    pub held_out: Vec<usize>,
+    /// The model's points.
+    pub points: Vec<Point>,
+    /// What is doubtful, and what was left out.
+    pub warnings: Vec<Fault>,
+    /// What surrounds the object in the photographs.
+    pub background: Background,
+    /// Whether black in the masks stands for the object.
+    pub(crate) mask_is_background: bool,
+    /// Per view, the proxy's bounds inside the undistorted photograph.
+    pub(crate) bounds: Vec<Bounds>,
+}
+
+/// What `capture.toml` and the folder say about the capture.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct CaptureInfo {
+    /// `collection/object`.
+    pub object: Option<String>,
+    /// Title for people.
+    pub title: Option<String>,
+    /// Licence of the photographs.
+    pub licence: Option<String>,
+    /// Holder of the rights.
+    pub rights: Option<String>,
+    /// Metres per unit of the world frame, where known.
+    pub metres_per_scene_unit: Option<f64>,
+    /// The proxy's path inside the capture.
+    pub proxy: PathBuf,
+}
+
+/// One photograph and its camera.
+#[derive(Debug, Clone)]
+pub struct View {
+    /// The image name in the model, which is the path below `images/`.
+    pub name: String,
+    /// The undistorted pinhole camera: the photograph's size, focal lengths and principal point without its
+    /// distortion, in the world frame.
+    pub camera: Camera,
+    /// The camera as the model has it, with distortion.
+    pub source: SourceCamera,
+    /// The photograph.
+    pub image_path: PathBuf,
+    /// Its mask, where the capture has masks.
+    pub mask_path: Option<PathBuf>,
+}
+
+/// A point of the sparse reconstruction.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Point {
+    /// World frame.
+    pub position: DVec3,
+    /// 8-bit sRGB.
+    pub color: [u8; 3],
+    /// Mean reprojection error in pixels of the photographs.
+    pub error_px: f64,
+    /// Indices of the views that saw it, ascending.
+    pub views: Vec<usize>,
+}
+
+/// What surrounds the object in the photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Background {
+    /// Masks are given, and the images are already black outside: the mask is the coverage that was multiplied into
+    /// the colours in linear light.
+    Black,
+    /// Masks are given, and the photographs show some background.
+    MaskedOut,
+    /// No masks: only the proxy's silhouette says where the object is.
+    Silhouette,
+}
