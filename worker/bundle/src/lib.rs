@@ -22,6 +22,7 @@ pub use metrics::Metrics;
 pub use pack::{Bundle, BundleWriter};
 pub use paths::held_out_file;
 pub use references::Reference;
+pub use report::{ReportInput, ReportView, render_report};
 pub use weights::{Precision, Tensor, Tensors};
 
 /// Name of the manifest inside a bundle.

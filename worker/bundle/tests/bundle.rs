@@ -310,11 +310,11 @@ fn hostile_manifests_are_refused() {
     let error = edited(dir.path(), |m| m["files"][1] = m["files"][0].clone());
     assert!(matches!(error, BundleError::Duplicate { .. }));
     let error = edited(dir.path(), |m| {
-        m["networks"]["composition"]["weights"] = json!("other.safetensors")
+        m["networks"]["composition"]["weights"] = json!("other.safetensors");
     });
     assert!(matches!(error, BundleError::Missing { file } if file == "other.safetensors"));
     let error = edited(dir.path(), |m| {
-        m["normalised_from_world"]["scale"] = json!(2.0)
+        m["normalised_from_world"]["scale"] = json!(2.0);
     });
     assert!(matches!(error, BundleError::Malformed { file, .. } if file == PROXY_FILE));
     let error = edited(dir.path(), |m| *m = json!([]));

@@ -1,0 +1,280 @@
+//! Plots as inline SVG, coloured by the page's style sheet.
+
+use super::escape;
+
+/// How tick values are written.
+#[derive(Clone, Copy)]
+pub(super) enum Unit {
+    Plain,
+    Seconds,
+    Bytes,
+}
+
+#[derive(Clone, Copy)]
+pub(super) struct Axis {
+    pub(super) label: &'static str,
+    pub(super) unit: Unit,
+}
+
+/// One method: a curve, a point, or (no training) a level.
+pub(super) struct Series {
+    class: String,
+    label: String,
+    points: Vec<(f64, f64)>,
+}
+
+impl Series {
+    /// Points that a logarithmic error axis cannot show are dropped.
+    pub(super) fn new(name: &str, label: &str, points: Vec<(f64, f64)>) -> Self {
+        let class = if matches!(name, "ours" | "ours_no_effects" | "paper" | "n_ibr" | "ibr" | "texture") { name } else { "other" };
+        let points = points.into_iter().filter(|(x, y)| x.is_finite() && y.is_finite() && *y > 0.0).collect();
+        Self { class: class.to_owned(), label: label.to_owned(), points }
+    }
+}
+
+/// Error over a cost, both logarithmic.
+pub(super) struct Plot {
+    pub(super) series: Vec<Series>,
+    pub(super) x: Axis,
+    pub(super) y: Axis,
+}
+
+const WIDTH: f64 = 640.0;
+const HEIGHT: f64 = 360.0;
+const LEFT: f64 = 52.0;
+const RIGHT: f64 = 150.0;
+const TOP: f64 = 26.0;
+const BOTTOM: f64 = 44.0;
+
+/// A logarithmic scale onto pixels.
+struct Scale {
+    from: f64,
+    to: f64,
+    start: f64,
+    end: f64,
+}
+
+impl Scale {
+    /// Covers `values` with a margin of a tenth of the decades, at least a fifth of a decade.
+    fn over(values: impl Iterator<Item = f64>, start: f64, end: f64) -> Option<Self> {
+        let (low, high) = values
+            .filter(|v| *v > 0.0)
+            .map(f64::log10)
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
+        let margin = (0.08 * (high - low)).max(0.1);
+        low.is_finite().then_some(Self { from: low - margin, to: high + margin, start, end })
+    }
+
+    fn at(&self, value: f64) -> f64 {
+        let share = (value.log10() - self.from) / (self.to - self.from);
+        self.start + share.clamp(0.0, 1.0) * (self.end - self.start)
+    }
+
+    /// 1, 2 and 5 times powers of ten; only 1 where there are many decades.
+    fn ticks(&self) -> Vec<f64> {
+        let steps: &[f64] = match self.to - self.from {
+            decades if decades > 3.5 => &[1.0],
+            decades if decades > 0.5 => &[1.0, 2.0, 5.0],
+            _ => &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0],
+        };
+        (self.from.floor() as i32..=self.to.ceil() as i32)
+            .flat_map(|exponent| steps.iter().map(move |step| step * 10_f64.powi(exponent)))
+            .filter(|v| (self.from..=self.to).contains(&v.log10()))
+            .collect()
+    }
+}
+
+impl Plot {
+    pub(super) fn svg(&self) -> String {
+        let points = || self.series.iter().flat_map(|s| &s.points);
+        let Some(y) = Scale::over(points().map(|p| p.1), HEIGHT - BOTTOM, TOP) else {
+            return String::new();
+        };
+        let Some(x) = Scale::over(points().map(|p| p.0), LEFT, WIDTH - RIGHT) else {
+            return String::new();
+        };
+        let (right, bottom) = (WIDTH - RIGHT, HEIGHT - BOTTOM);
+        let grid: String = x
+            .ticks()
+            .iter()
+            .map(|&v| {
+                let at = x.at(v);
+                format!(
+                    "<line class=\"grid\" x1=\"{at:.1}\" y1=\"{TOP}\" x2=\"{at:.1}\" y2=\"{bottom}\"/>\
+                     <text class=\"tick\" x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>",
+                    bottom + 16.0,
+                    tick(v, self.x.unit)
+                )
+            })
+            .chain(y.ticks().iter().map(|&v| {
+                let at = y.at(v);
+                format!(
+                    "<line class=\"grid\" x1=\"{LEFT}\" y1=\"{at:.1}\" x2=\"{right}\" y2=\"{at:.1}\"/>\
+                     <text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
+                    LEFT - 7.0,
+                    at + 4.0,
+                    tick(v, self.y.unit)
+                )
+            }))
+            .collect();
+        let marks: String = self.series.iter().map(|series| mark(series, &x, &y)).collect();
+        let ends: Vec<(f64, f64, &Series)> = self
+            .series
+            .iter()
+            .filter_map(|s| {
+                let (px, py) = *s.points.last()?;
+                let from = if px > 0.0 { x.at(px) } else { right };
+                Some((y.at(py), from, s))
+            })
+            .collect();
+        format!(
+            "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{} against {}\">{grid}\
+             <text class=\"axis\" x=\"{LEFT}\" y=\"14\">{}</text>\
+             <text class=\"axis\" x=\"{right}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>{marks}{}</svg>",
+            self.y.label,
+            self.x.label,
+            self.y.label,
+            HEIGHT - 8.0,
+            self.x.label,
+            labels(ends, right, bottom)
+        )
+    }
+}
+
+/// A curve with dots, or a dashed level for a method whose only cost is zero.
+fn mark(series: &Series, x: &Scale, y: &Scale) -> String {
+    match series.points.as_slice() {
+        [] => String::new(),
+        [(cost, error)] if *cost <= 0.0 => {
+            let at = y.at(*error);
+            format!(
+                "<line class=\"level m-{}\" x1=\"{}\" y1=\"{at:.1}\" x2=\"{}\" y2=\"{at:.1}\"/>",
+                series.class, x.start, x.end
+            )
+        }
+        points => {
+            // A curve that starts before any time has passed starts on the axis.
+            let place = |(cost, error): &(f64, f64)| (if *cost > 0.0 { x.at(*cost) } else { x.start }, y.at(*error));
+            let path: Vec<String> =
+                points.iter().map(place).map(|(px, py)| format!("{px:.1},{py:.1}")).collect();
+            let dots: String = points
+                .iter()
+                .map(place)
+                .map(|(px, py)| format!("<circle class=\"dot m-{}\" cx=\"{px:.1}\" cy=\"{py:.1}\" r=\"3.5\"/>", series.class))
+                .collect();
+            format!("<polyline class=\"curve m-{}\" points=\"{}\"/>{dots}", series.class, path.join(" "))
+        }
+    }
+}
+
+/// Names at the right border, pushed apart where they would overlap, each with a line to its mark.
+fn labels(mut ends: Vec<(f64, f64, &Series)>, right: f64, bottom: f64) -> String {
+    const LINE: f64 = 16.0;
+    ends.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut places: Vec<f64> = ends.iter().map(|(at, _, _)| *at).collect();
+    for i in 1..places.len() {
+        places[i] = places[i].max(places[i - 1] + LINE);
+    }
+    let mut limit = bottom;
+    for place in places.iter_mut().rev() {
+        *place = place.min(limit);
+        limit = *place - LINE;
+    }
+    ends.iter()
+        .zip(places)
+        .map(|((at, from, series), place)| {
+            format!(
+                "<path class=\"leader m-{class}\" d=\"M{:.1} {at:.1}H{right}L{:.1} {place:.1}\"/>\
+                 <text class=\"name m-{class}\" x=\"{:.1}\" y=\"{:.1}\">{}</text>",
+                from + 5.0,
+                right + 12.0,
+                right + 16.0,
+                place + 4.0,
+                escape(&series.label),
+                class = series.class,
+            )
+        })
+        .collect()
+}
+
+fn tick(value: f64, unit: Unit) -> String {
+    let plain = |v: f64| if v >= 1.0 { format!("{}", (v * 10.0).round() / 10.0) } else { format!("{}", (v * 1e4).round() / 1e4) };
+    match unit {
+        Unit::Plain => plain(value),
+        Unit::Seconds => format!("{} s", plain(value)),
+        Unit::Bytes if value >= 1e6 => format!("{} MB", plain(value / 1e6)),
+        Unit::Bytes if value >= 1e3 => format!("{} kB", plain(value / 1e3)),
+        Unit::Bytes => format!("{} B", plain(value)),
+    }
+}
+
+/// One held-out view in [`views`].
+pub(super) struct ViewRow<'a> {
+    pub(super) name: &'a str,
+    pub(super) ours: f64,
+    pub(super) baseline: Option<f64>,
+    pub(super) marked: bool,
+}
+
+/// Error of each view from left to right, logarithmic, ours and the baseline joined by a line.
+pub(super) fn views(rows: &[ViewRow<'_>]) -> String {
+    const HEIGHT: f64 = 220.0;
+    const BOTTOM: f64 = 190.0;
+    let errors = rows.iter().flat_map(|r| [Some(r.ours), r.baseline]).flatten();
+    let Some(y) = Scale::over(errors, BOTTOM, TOP) else {
+        return String::new();
+    };
+    let (left, right) = (LEFT, WIDTH - 20.0);
+    let step = (right - left) / rows.len() as f64;
+    let grid: String = y
+        .ticks()
+        .iter()
+        .map(|&v| {
+            let at = y.at(v);
+            format!(
+                "<line class=\"grid\" x1=\"{left}\" y1=\"{at:.1}\" x2=\"{right}\" y2=\"{at:.1}\"/>\
+                 <text class=\"tick\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
+                left - 7.0,
+                at + 4.0,
+                tick(v, Unit::Plain)
+            )
+        })
+        .collect();
+    let marks: String = rows
+        .iter()
+        .enumerate()
+        .map(|(index, row)| {
+            let at = left + (index as f64 + 0.5) * step;
+            let ours = y.at(row.ours.max(f64::MIN_POSITIVE));
+            let other = row.baseline.map_or_else(String::new, |baseline| {
+                let other = y.at(baseline.max(f64::MIN_POSITIVE));
+                format!(
+                    "<line class=\"join\" x1=\"{at:.1}\" y1=\"{ours:.1}\" x2=\"{at:.1}\" y2=\"{other:.1}\"/>\
+                     <circle class=\"ring\" cx=\"{at:.1}\" cy=\"{other:.1}\" r=\"3.5\"/>"
+                )
+            });
+            let mark = if row.marked {
+                let near_end = at > right - 90.0;
+                format!(
+                    "<text class=\"name marked\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"{}\">{}</text>",
+                    if near_end { at + 4.0 } else { at - 4.0 },
+                    BOTTOM + 18.0,
+                    if near_end { "end" } else { "start" },
+                    escape(row.name)
+                )
+            } else {
+                String::new()
+            };
+            format!(
+                "<g><title>{}: {:.2}</title>{other}<circle class=\"dot m-ours{}\" cx=\"{at:.1}\" cy=\"{ours:.1}\" r=\"4\"/>{mark}</g>",
+                escape(row.name),
+                row.ours,
+                if row.marked { " marked" } else { "" }
+            )
+        })
+        .collect();
+    format!(
+        "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"error of each held-out view\">{grid}\
+         <text class=\"axis\" x=\"{left}\" y=\"14\">mean squared error, 0 to 255</text>{marks}</svg>"
+    )
+}
