@@ -4,6 +4,11 @@
 //! style and plots are inline, images are data URIs, so the page can be mailed, archived and opened in ten years. It
 //! follows the reader's light or dark setting and fits a phone.
 
+#![expect(
+    clippy::format_collect,
+    reason = "one page: clarity before allocations"
+)]
+
 use std::fmt::Display;
 
 use image::RgbImage;
@@ -79,24 +84,47 @@ pub fn render_report(input: &ReportInput<'_>) -> String {
 
 fn header(input: &ReportInput<'_>, verdict: &Verdict) -> String {
     let object = &input.manifest.object;
-    let figures = input.metrics.method("ours").map_or_else(String::new, |ours| {
-        let against = input.metrics.best_baseline().map_or_else(String::new, |baseline| {
-            let ratio = if baseline.mse > 0.0 { ours.mse / baseline.mse } else { 1.0 };
-            figure_card(
-                &format!("{:.0} %", 100.0 * ratio),
-                &format!("of the error of {} ({})", method_label(&baseline.name), significant(baseline.mse)),
-            )
+    let figures = input
+        .metrics
+        .method("ours")
+        .map_or_else(String::new, |ours| {
+            let against = input
+                .metrics
+                .best_baseline()
+                .map_or_else(String::new, |baseline| {
+                    let ratio = if baseline.mse > 0.0 {
+                        ours.mse / baseline.mse
+                    } else {
+                        1.0
+                    };
+                    figure_card(
+                        &format!("{:.0} %", 100.0 * ratio),
+                        &format!(
+                            "of the error of {} ({})",
+                            method_label(&baseline.name),
+                            significant(baseline.mse)
+                        ),
+                    )
+                });
+            [
+                figure_card(
+                    &significant(ours.mse),
+                    "mean squared error, full frame, 0 to 255",
+                ),
+                against,
+                figure_card(
+                    &format!("{:.1} dB", ours.psnr),
+                    "PSNR, mean over held-out views",
+                ),
+                figure_card(&duration(ours.train_secs), "training"),
+                figure_card(
+                    &format!("{} ms", significant(ours.render_ms)),
+                    "to render a frame",
+                ),
+                figure_card(&bytes(ours.bundle_bytes), "bundle"),
+            ]
+            .concat()
         });
-        [
-            figure_card(&significant(ours.mse), "mean squared error, full frame, 0 to 255"),
-            against,
-            figure_card(&format!("{:.1} dB", ours.psnr), "PSNR, mean over held-out views"),
-            figure_card(&duration(ours.train_secs), "training"),
-            figure_card(&format!("{} ms", significant(ours.render_ms)), "to render a frame"),
-            figure_card(&bytes(ours.bundle_bytes), "bundle"),
-        ]
-        .concat()
-    });
     format!(
         "<header><p class=\"kicker\">{} / {}</p><h1>{}</h1></header>\
          <section class=\"verdict {}\"><h2>{}</h2><p>{}</p></section><div class=\"cards\">{figures}</div>",
@@ -105,12 +133,15 @@ fn header(input: &ReportInput<'_>, verdict: &Verdict) -> String {
         escape(input.title),
         verdict.class(),
         verdict.headline(),
-        escape(&verdict.explanation(input.metrics)),
+        escape(verdict.explanation(input.metrics)),
     )
 }
 
 fn figure_card(value: &str, caption: &str) -> String {
-    format!("<div class=\"card\"><b>{value}</b><span>{}</span></div>", escape(caption))
+    format!(
+        "<div class=\"card\"><b>{value}</b><span>{}</span></div>",
+        escape(caption)
+    )
 }
 
 fn pictures_section(input: &ReportInput<'_>) -> String {
@@ -128,19 +159,41 @@ fn pictures_section(input: &ReportInput<'_>) -> String {
                 figure(&view.ours, "ours"),
                 figure(&view.baseline, &baseline),
                 figure(&scale.map(&view.ours, &view.target), "error, ours"),
-                figure(&scale.map(&view.baseline, &view.target), &format!("error, {baseline}")),
+                figure(
+                    &scale.map(&view.baseline, &view.target),
+                    &format!("error, {baseline}"),
+                ),
             ];
-            figures.extend(view.diffuse.as_ref().map(|image| figure(image, "estimated diffuse")));
-            figures.extend(view.effects.as_ref().map(|image| figure(image, "estimated effects")));
-            let worst = input.metrics.method("ours").is_some_and(|ours| ours.worst_view.name == view.name);
-            let per_method = [("ours", "ours"), (view.baseline_name.as_str(), baseline.as_str())]
-                .iter()
-                .filter_map(|(name, label)| {
-                    let row = input.metrics.method(name)?.per_view.iter().find(|v| v.name == view.name)?;
-                    Some(format!("{label} {}", significant(row.mse)))
-                })
-                .collect::<Vec<_>>()
-                .join(", ");
+            figures.extend(
+                view.diffuse
+                    .as_ref()
+                    .map(|image| figure(image, "estimated diffuse")),
+            );
+            figures.extend(
+                view.effects
+                    .as_ref()
+                    .map(|image| figure(image, "estimated effects")),
+            );
+            let worst = input
+                .metrics
+                .method("ours")
+                .is_some_and(|ours| ours.worst_view.name == view.name);
+            let per_method = [
+                ("ours", "ours"),
+                (view.baseline_name.as_str(), baseline.as_str()),
+            ]
+            .iter()
+            .filter_map(|(name, label)| {
+                let row = input
+                    .metrics
+                    .method(name)?
+                    .per_view
+                    .iter()
+                    .find(|v| v.name == view.name)?;
+                Some(format!("{label} {}", significant(row.mse)))
+            })
+            .collect::<Vec<_>>()
+            .join(", ");
             format!(
                 "<article><h3>{}{}</h3><p class=\"note\">mean squared error: {per_method}</p>\
                  <div class=\"pictures\">{}</div></article>",
@@ -158,7 +211,11 @@ fn pictures_section(input: &ReportInput<'_>) -> String {
 }
 
 fn methods_section(metrics: &Metrics) -> String {
-    let best = metrics.methods.iter().map(|m| m.mse).fold(f64::INFINITY, f64::min);
+    let best = metrics
+        .methods
+        .iter()
+        .map(|m| m.mse)
+        .fold(f64::INFINITY, f64::min);
     let mut methods: Vec<&MethodMetrics> = metrics.methods.iter().collect();
     methods.sort_by(|a, b| a.mse.total_cmp(&b.mse));
     let rows: String = methods
@@ -168,7 +225,7 @@ fn methods_section(metrics: &Metrics) -> String {
                 "<tr class=\"{}\"><th scope=\"row\">{}<code>{}</code></th><td>{}</td><td>{}</td><td>{:.2}</td><td>{:.2}</td>\
                  <td>{:.4}</td><td>{}</td><td>{} <small>{}</small></td><td>{}</td><td>{}</td><td>{}</td></tr>",
                 if m.name == "ours" { "ours" } else { "" },
-                escape(&method_label(&m.name)),
+                escape(method_label(&m.name)),
                 escape(&m.name),
                 if m.mse <= best { format!("<b>{}</b>", significant(m.mse)) } else { significant(m.mse) },
                 significant(m.mse_object),
@@ -197,33 +254,84 @@ fn methods_section(metrics: &Metrics) -> String {
 
 fn speed_section(metrics: &Metrics) -> String {
     let mut names: Vec<&str> = Vec::new();
-    for name in metrics.speed_error.iter().map(|p| p.method.as_str()).chain(metrics.methods.iter().map(|m| m.name.as_str())) {
+    for name in metrics
+        .speed_error
+        .iter()
+        .map(|p| p.method.as_str())
+        .chain(metrics.methods.iter().map(|m| m.name.as_str()))
+    {
         if !names.contains(&name) {
             names.push(name);
         }
     }
     let series = |points: &dyn Fn(&str) -> Vec<(f64, f64)>| -> Vec<Series> {
-        names.iter().map(|name| Series::new(name, &method_label(name), points(name))).collect()
+        names
+            .iter()
+            .map(|name| Series::new(name, &method_label(name), points(name)))
+            .collect()
     };
     let training = series(&|name| {
-        let curve: Vec<(f64, f64)> =
-            metrics.speed_error.iter().filter(|p| p.method == name).map(|p| (p.secs, p.mse)).collect();
+        let curve: Vec<(f64, f64)> = metrics
+            .speed_error
+            .iter()
+            .filter(|p| p.method == name)
+            .map(|p| (p.secs, p.mse))
+            .collect();
         match metrics.method(name) {
             Some(m) if curve.is_empty() => vec![(m.train_secs, m.mse)],
             _ => curve,
         }
     });
     let of_method = |pick: fn(&MethodMetrics) -> f64| {
-        series(&|name| metrics.method(name).map(|m| (pick(m), m.mse)).into_iter().collect())
+        series(&|name| {
+            metrics
+                .method(name)
+                .map(|m| (pick(m), m.mse))
+                .into_iter()
+                .collect()
+        })
     };
-    let error = Axis { label: "mean squared error, 0 to 255", unit: plot::Unit::Plain };
-    let panel = |series, x: Axis| Plot { series, x, y: error }.svg();
+    let error = Axis {
+        label: "mean squared error, 0 to 255",
+        unit: plot::Unit::Plain,
+    };
+    let (wide, small) = ((plot::WIDTH, 330.0), (430.0, 280.0));
+    let panel = |size, series, x: Axis| {
+        Plot {
+            size,
+            series,
+            x,
+            y: error,
+        }
+        .svg()
+    };
     format!(
         "<section><h2>Speed against error</h2><p class=\"note\">Lower and further left is better. Both axes are \
-         logarithmic; a dashed line is a method that needs no training.</p>{}<div class=\"pair\">{}{}</div></section>",
-        panel(training, Axis { label: "training time", unit: plot::Unit::Seconds }),
-        panel(of_method(|m| m.render_ms), Axis { label: "milliseconds per frame", unit: plot::Unit::Plain }),
-        panel(of_method(|m| m.bundle_bytes as f64), Axis { label: "bytes a viewer downloads", unit: plot::Unit::Bytes }),
+         logarithmic; a dashed line is a method that needs no training.</p><div class=\"wide\">{}</div><div class=\"pair\">{}{}</div></section>",
+        panel(
+            wide,
+            training,
+            Axis {
+                label: "training time",
+                unit: plot::Unit::Seconds
+            }
+        ),
+        panel(
+            small,
+            of_method(|m| m.render_ms),
+            Axis {
+                label: "milliseconds per frame",
+                unit: plot::Unit::Plain
+            }
+        ),
+        panel(
+            small,
+            of_method(|m| m.bundle_bytes as f64),
+            Axis {
+                label: "bytes a viewer downloads",
+                unit: plot::Unit::Bytes
+            }
+        ),
     )
 }
 
@@ -237,7 +345,11 @@ fn views_section(metrics: &Metrics, verdict: &Verdict) -> String {
         .map(|view| plot::ViewRow {
             name: &view.name,
             ours: view.mse,
-            baseline: baseline.per_view.iter().find(|v| v.name == view.name).map(|v| v.mse),
+            baseline: baseline
+                .per_view
+                .iter()
+                .find(|v| v.name == view.name)
+                .map(|v| v.mse),
             marked: verdict.views().contains(&view.name),
         })
         .collect();
@@ -246,7 +358,7 @@ fn views_section(metrics: &Metrics, verdict: &Verdict) -> String {
     }
     format!(
         "<section><h2>Error along the camera path</h2><p class=\"note\">Each held-out view in the capture's order: ours \
-         (filled) and {} (ring). Views to look at are marked.</p>{}</section>",
+         (filled) and {} (ring). Views to look at are marked.</p><div class=\"wide\">{}</div></section>",
         method_label(&baseline.name),
         plot::views(&rows)
     )
@@ -256,7 +368,11 @@ fn plan_section(input: &ReportInput<'_>) -> String {
     if input.plan.is_empty() {
         return String::new();
     }
-    let sentences: String = input.plan.iter().map(|s| format!("<li>{}</li>", escape(s))).collect();
+    let sentences: String = input
+        .plan
+        .iter()
+        .map(|s| format!("<li>{}</li>", escape(s)))
+        .collect();
     format!("<section><h2>What the plan decided</h2><ol>{sentences}</ol></section>")
 }
 
@@ -277,15 +393,32 @@ fn provenance_section(input: &ReportInput<'_>) -> String {
         })
         .collect();
     let views = &input.metrics.views;
-    let seeds = provenance.seeds.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    let seeds = provenance
+        .seeds
+        .iter()
+        .map(ToString::to_string)
+        .collect::<Vec<_>>()
+        .join(", ");
     let entries: String = [
         ("software", provenance.software.clone()),
-        ("commit", provenance.git.clone().unwrap_or_else(|| "unknown".to_owned())),
+        (
+            "commit",
+            provenance
+                .git
+                .clone()
+                .unwrap_or_else(|| "unknown".to_owned()),
+        ),
         ("device", provenance.device.clone()),
         ("seeds", seeds),
         ("started", provenance.started_at.clone()),
         ("finished", provenance.finished_at.clone()),
-        ("views", format!("{} trained on, {} held out, {} references", views.train, views.held_out, views.references)),
+        (
+            "views",
+            format!(
+                "{} trained on, {} held out, {} references",
+                views.train, views.held_out, views.references
+            ),
+        ),
         ("capture", input.manifest.capture.clone()),
         ("recipe", input.manifest.recipe.to_string()),
     ]
@@ -365,9 +498,28 @@ mod tests {
 
     #[test]
     fn figures_are_short() {
-        assert_eq!([significant(0.1234), significant(4.567), significant(45.67), significant(456.7)], ["0.123", "4.57", "45.7", "457"]);
-        assert_eq!([duration(1.23), duration(59.6), duration(250.0), duration(7260.0)], ["1.2 s", "60 s", "4 min 10 s", "2 h 01 min"]);
-        assert_eq!([bytes(12), bytes(4096), bytes(12_345_678)], ["12 B", "4.10 kB", "12.3 MB"]);
+        assert_eq!(
+            [
+                significant(0.1234),
+                significant(4.567),
+                significant(45.67),
+                significant(456.7)
+            ],
+            ["0.123", "4.57", "45.7", "457"]
+        );
+        assert_eq!(
+            [
+                duration(1.23),
+                duration(59.6),
+                duration(250.0),
+                duration(7260.0)
+            ],
+            ["1.2 s", "60 s", "4 min 10 s", "2 h 01 min"]
+        );
+        assert_eq!(
+            [bytes(12), bytes(4096), bytes(12_345_678)],
+            ["12 B", "4.10 kB", "12.3 MB"]
+        );
     }
 
     #[test]

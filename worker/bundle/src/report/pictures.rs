@@ -11,8 +11,15 @@ use crate::pack::encode_png;
 const HARD_PIXELS_BELOW: u32 = 200;
 
 /// Colours of the error map, from none to the scale's end; equal steps, lightness rises throughout.
-const RAMP: [[u8; 3]; 7] =
-    [[9, 9, 20], [46, 26, 78], [110, 37, 106], [175, 55, 90], [228, 98, 58], [250, 164, 60], [252, 248, 190]];
+const RAMP: [[u8; 3]; 7] = [
+    [9, 9, 20],
+    [46, 26, 78],
+    [110, 37, 106],
+    [175, 55, 90],
+    [228, 98, 58],
+    [250, 164, 60],
+    [252, 248, 190],
+];
 
 /// One scale for all error maps of a page: the largest channel difference of a pixel, on [0, 255].
 pub(super) struct ErrorScale {
@@ -37,7 +44,9 @@ impl ErrorScale {
             seen += count;
             seen * 1000 >= total * 995
         });
-        Self { end: end.unwrap_or(255).max(8) as f64 }
+        Self {
+            end: end.unwrap_or(255).max(8) as f64,
+        }
     }
 
     pub(super) fn map(&self, image: &RgbImage, target: &RgbImage) -> RgbImage {
@@ -49,7 +58,10 @@ impl ErrorScale {
     }
 
     pub(super) fn legend(&self) -> String {
-        let stops: Vec<String> = RAMP.iter().map(|[r, g, b]| format!("rgb({r} {g} {b})")).collect();
+        let stops: Vec<String> = RAMP
+            .iter()
+            .map(|[r, g, b]| format!("rgb({r} {g} {b})"))
+            .collect();
         format!(
             "<p class=\"legend\"><span>0</span><i style=\"background:linear-gradient(90deg,{})\"></i><span>{:.0} of 255 and \
              more</span></p>",
@@ -66,7 +78,13 @@ fn errors<'a>(image: &'a RgbImage, target: &'a RgbImage) -> impl Iterator<Item =
         .pixels()
         .zip(target.pixels())
         .filter(move |_| comparable)
-        .map(|(a, b)| a.0.iter().zip(b.0).map(|(&a, b)| a.abs_diff(b)).max().unwrap_or(0))
+        .map(|(a, b)| {
+            a.0.iter()
+                .zip(b.0)
+                .map(|(&a, b)| a.abs_diff(b))
+                .max()
+                .unwrap_or(0)
+        })
 }
 
 fn ramp(position: f64) -> [u8; 3] {
@@ -82,9 +100,16 @@ fn ramp(position: f64) -> [u8; 3] {
 /// A captioned image.
 pub(super) fn figure(image: &RgbImage, caption: &str) -> String {
     let Ok(png) = encode_png("report.html", image) else {
-        return format!("<figure><div class=\"absent\">no picture</div><figcaption>{}</figcaption></figure>", escape(caption));
+        return format!(
+            "<figure><div class=\"absent\">no picture</div><figcaption>{}</figcaption></figure>",
+            escape(caption)
+        );
     };
-    let class = if image.width() < HARD_PIXELS_BELOW { " class=\"hard\"" } else { "" };
+    let class = if image.width() < HARD_PIXELS_BELOW {
+        " class=\"hard\""
+    } else {
+        ""
+    };
     format!(
         "<figure><img{class} src=\"data:image/png;base64,{}\" width=\"{}\" height=\"{}\" alt=\"{caption}\">\
          <figcaption>{caption}</figcaption></figure>",

@@ -26,23 +26,40 @@ pub(super) struct Series {
 impl Series {
     /// Points that a logarithmic error axis cannot show are dropped.
     pub(super) fn new(name: &str, label: &str, points: Vec<(f64, f64)>) -> Self {
-        let class = if matches!(name, "ours" | "ours_no_effects" | "paper" | "n_ibr" | "ibr" | "texture") { name } else { "other" };
-        let points = points.into_iter().filter(|(x, y)| x.is_finite() && y.is_finite() && *y > 0.0).collect();
-        Self { class: class.to_owned(), label: label.to_owned(), points }
+        let class = if matches!(
+            name,
+            "ours" | "ours_no_effects" | "paper" | "n_ibr" | "ibr" | "texture"
+        ) {
+            name
+        } else {
+            "other"
+        };
+        let points = points
+            .into_iter()
+            .filter(|(x, y)| x.is_finite() && y.is_finite() && *y > 0.0)
+            .collect();
+        Self {
+            class: class.to_owned(),
+            label: label.to_owned(),
+            points,
+        }
     }
 }
 
 /// Error over a cost, both logarithmic.
 pub(super) struct Plot {
+    /// Width and height of the drawing; the page scales it to the column.
+    pub(super) size: (f64, f64),
     pub(super) series: Vec<Series>,
     pub(super) x: Axis,
     pub(super) y: Axis,
 }
 
-const WIDTH: f64 = 640.0;
-const HEIGHT: f64 = 360.0;
-const LEFT: f64 = 52.0;
-const RIGHT: f64 = 150.0;
+/// Of the wide plots.
+pub(super) const WIDTH: f64 = 560.0;
+const LEFT: f64 = 46.0;
+/// Room for the names beside a plot, also in the larger type of a phone.
+const RIGHT: f64 = 152.0;
 const TOP: f64 = 26.0;
 const BOTTOM: f64 = 44.0;
 
@@ -60,9 +77,16 @@ impl Scale {
         let (low, high) = values
             .filter(|v| *v > 0.0)
             .map(f64::log10)
-            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+                (low.min(v), high.max(v))
+            });
         let margin = (0.08 * (high - low)).max(0.1);
-        low.is_finite().then_some(Self { from: low - margin, to: high + margin, start, end })
+        low.is_finite().then_some(Self {
+            from: low - margin,
+            to: high + margin,
+            start,
+            end,
+        })
     }
 
     fn at(&self, value: f64) -> f64 {
@@ -70,11 +94,13 @@ impl Scale {
         self.start + share.clamp(0.0, 1.0) * (self.end - self.start)
     }
 
-    /// 1, 2 and 5 times powers of ten; only 1 where there are many decades.
+    /// 1, 2 and 5 times powers of ten; only 1 where the decades lie too close for labels between.
     fn ticks(&self) -> Vec<f64> {
-        let steps: &[f64] = match self.to - self.from {
-            decades if decades > 3.5 => &[1.0],
-            decades if decades > 0.5 => &[1.0, 2.0, 5.0],
+        const ROOM: f64 = 130.0;
+        let decades = self.to - self.from;
+        let steps: &[f64] = match decades {
+            _ if (self.end - self.start).abs() < ROOM * decades => &[1.0],
+            _ if decades > 0.5 => &[1.0, 2.0, 5.0],
             _ => &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0],
         };
         (self.from.floor() as i32..=self.to.ceil() as i32)
@@ -86,14 +112,15 @@ impl Scale {
 
 impl Plot {
     pub(super) fn svg(&self) -> String {
+        let (width, height) = self.size;
         let points = || self.series.iter().flat_map(|s| &s.points);
-        let Some(y) = Scale::over(points().map(|p| p.1), HEIGHT - BOTTOM, TOP) else {
+        let Some(y) = Scale::over(points().map(|p| p.1), height - BOTTOM, TOP) else {
             return String::new();
         };
-        let Some(x) = Scale::over(points().map(|p| p.0), LEFT, WIDTH - RIGHT) else {
+        let Some(x) = Scale::over(points().map(|p| p.0), LEFT, width - RIGHT) else {
             return String::new();
         };
-        let (right, bottom) = (WIDTH - RIGHT, HEIGHT - BOTTOM);
+        let (right, bottom) = (width - RIGHT, height - BOTTOM);
         let grid: String = x
             .ticks()
             .iter()
@@ -117,7 +144,11 @@ impl Plot {
                 )
             }))
             .collect();
-        let marks: String = self.series.iter().map(|series| mark(series, &x, &y)).collect();
+        let marks: String = self
+            .series
+            .iter()
+            .map(|series| mark(series, &x, &y))
+            .collect();
         let ends: Vec<(f64, f64, &Series)> = self
             .series
             .iter()
@@ -128,13 +159,13 @@ impl Plot {
             })
             .collect();
         format!(
-            "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{} against {}\">{grid}\
+            "<svg viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{} against {}\">{grid}\
              <text class=\"axis\" x=\"{LEFT}\" y=\"14\">{}</text>\
              <text class=\"axis\" x=\"{right}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>{marks}{}</svg>",
             self.y.label,
             self.x.label,
             self.y.label,
-            HEIGHT - 8.0,
+            height - 8.0,
             self.x.label,
             labels(ends, right, bottom)
         )
@@ -154,15 +185,32 @@ fn mark(series: &Series, x: &Scale, y: &Scale) -> String {
         }
         points => {
             // A curve that starts before any time has passed starts on the axis.
-            let place = |(cost, error): &(f64, f64)| (if *cost > 0.0 { x.at(*cost) } else { x.start }, y.at(*error));
-            let path: Vec<String> =
-                points.iter().map(place).map(|(px, py)| format!("{px:.1},{py:.1}")).collect();
+            let place = |(cost, error): &(f64, f64)| {
+                (
+                    if *cost > 0.0 { x.at(*cost) } else { x.start },
+                    y.at(*error),
+                )
+            };
+            let path: Vec<String> = points
+                .iter()
+                .map(place)
+                .map(|(px, py)| format!("{px:.1},{py:.1}"))
+                .collect();
             let dots: String = points
                 .iter()
                 .map(place)
-                .map(|(px, py)| format!("<circle class=\"dot m-{}\" cx=\"{px:.1}\" cy=\"{py:.1}\" r=\"3.5\"/>", series.class))
+                .map(|(px, py)| {
+                    format!(
+                        "<circle class=\"dot m-{}\" cx=\"{px:.1}\" cy=\"{py:.1}\" r=\"3.5\"/>",
+                        series.class
+                    )
+                })
                 .collect();
-            format!("<polyline class=\"curve m-{}\" points=\"{}\"/>{dots}", series.class, path.join(" "))
+            format!(
+                "<polyline class=\"curve m-{}\" points=\"{}\"/>{dots}",
+                series.class,
+                path.join(" ")
+            )
         }
     }
 }
@@ -198,7 +246,13 @@ fn labels(mut ends: Vec<(f64, f64, &Series)>, right: f64, bottom: f64) -> String
 }
 
 fn tick(value: f64, unit: Unit) -> String {
-    let plain = |v: f64| if v >= 1.0 { format!("{}", (v * 10.0).round() / 10.0) } else { format!("{}", (v * 1e4).round() / 1e4) };
+    let plain = |v: f64| {
+        if v >= 1.0 {
+            format!("{}", (v * 10.0).round() / 10.0)
+        } else {
+            format!("{}", (v * 1e4).round() / 1e4)
+        }
+    };
     match unit {
         Unit::Plain => plain(value),
         Unit::Seconds => format!("{} s", plain(value)),
@@ -220,7 +274,10 @@ pub(super) struct ViewRow<'a> {
 pub(super) fn views(rows: &[ViewRow<'_>]) -> String {
     const HEIGHT: f64 = 220.0;
     const BOTTOM: f64 = 190.0;
-    let errors = rows.iter().flat_map(|r| [Some(r.ours), r.baseline]).flatten();
+    let errors = rows
+        .iter()
+        .flat_map(|r| [Some(r.ours), r.baseline])
+        .flatten();
     let Some(y) = Scale::over(errors, BOTTOM, TOP) else {
         return String::new();
     };

@@ -41,18 +41,28 @@ impl Verdict {
             .iter()
             .filter(|view| {
                 let worse = |b: &crate::metrics::MethodMetrics| {
-                    b.per_view.iter().any(|other| other.name == view.name && other.mse < view.mse)
+                    b.per_view
+                        .iter()
+                        .any(|other| other.name == view.name && other.mse < view.mse)
                 };
                 view.mse > OUTLIER * median || baseline.is_some_and(worse)
             })
             .map(|view| view.name.clone())
             .collect();
-        if views.is_empty() { Self::Good } else { Self::Look(views) }
+        if views.is_empty() {
+            Self::Good
+        } else {
+            Self::Look(views)
+        }
     }
 
     /// Views to look at.
     pub(super) fn views(&self) -> &[String] {
-        if let Self::Look(views) = self { views } else { &[] }
+        if let Self::Look(views) = self {
+            views
+        } else {
+            &[]
+        }
     }
 
     pub(super) fn class(&self) -> &'static str {
@@ -75,7 +85,8 @@ impl Verdict {
 
     pub(super) fn explanation(&self, metrics: &Metrics) -> String {
         let (Some(ours), Some(baseline)) = (metrics.method("ours"), metrics.best_baseline()) else {
-            return "No held-out views were rendered, so nothing can be said about quality.".to_owned();
+            return "No held-out views were rendered, so nothing can be said about quality."
+                .to_owned();
         };
         let label = super::method_label(&baseline.name);
         match self {
@@ -97,13 +108,24 @@ impl Verdict {
                 super::significant(baseline.mse),
                 super::significant(ours.mse)
             ),
-            Self::Unknown => "No held-out views were rendered, so nothing can be said about quality.".to_owned(),
+            Self::Unknown => {
+                "No held-out views were rendered, so nothing can be said about quality.".to_owned()
+            }
         }
     }
 }
 
 fn shortened(views: &[String]) -> String {
     const SHOWN: usize = 5;
-    let names = views.iter().take(SHOWN).cloned().collect::<Vec<_>>().join(", ");
-    if views.len() > SHOWN { format!("{names} and {} more", views.len() - SHOWN) } else { names }
+    let names = views
+        .iter()
+        .take(SHOWN)
+        .cloned()
+        .collect::<Vec<_>>()
+        .join(", ");
+    if views.len() > SHOWN {
+        format!("{names} and {} more", views.len() - SHOWN)
+    } else {
+        names
+    }
 }
