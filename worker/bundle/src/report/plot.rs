@@ -96,10 +96,11 @@ impl Scale {
 
     /// 1, 2 and 5 times powers of ten; only 1 where the decades lie too close for labels between.
     fn ticks(&self) -> Vec<f64> {
-        const ROOM: f64 = 130.0;
+        // Labels need more room beside each other than above each other.
+        let room = if self.end > self.start { 130.0 } else { 60.0 };
         let decades = self.to - self.from;
         let steps: &[f64] = match decades {
-            _ if (self.end - self.start).abs() < ROOM * decades => &[1.0],
+            _ if (self.end - self.start).abs() < room * decades => &[1.0],
             _ if decades > 0.5 => &[1.0, 2.0, 5.0],
             _ => &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0],
         };
