@@ -1,0 +1,113 @@
+#!/usr/bin/env python3
+"""Everything that must pass, one step after the other; `make test` runs it.
+
+Installs what the tests need (Postgres server programs from the distribution, libtorch into the per-user cache),
+checks formats and lints, proves that the command line tool and the coordinator need no libtorch, builds and runs all
+tests. A failed step does not hide the next one. The last line is `N passed, N failed`, summed over all test binaries;
+a failed step other than the tests counts as one failure. The exit status is 0 only if nothing failed.
+"""
+
+import glob
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+NO_TORCH = ["-p", "ignctl", "-p", "ign-coordinator"]
+RESULT = re.compile(r"^test result: \w+\. (\d+) passed; (\d+) failed;")
+
+
+def say(text):
+    print(f"test: {text}", flush=True)
+
+
+def run(*command, env=None):
+    """Runs a command with its output shown; whether it succeeded."""
+    say("$ " + " ".join(command))
+    started = time.monotonic()
+    status = subprocess.run(command, cwd=ROOT, env={**os.environ, **(env or {})}, check=False).returncode
+    say(f"{'ok' if status == 0 else f'failed with status {status}'} after {time.monotonic() - started:.0f} s")
+    return status == 0
+
+
+def install_postgres():
+    """The server's programs; the tests start clusters of their own with them."""
+    if os.environ.get("IGN_POSTGRES_BIN") or glob.glob("/usr/lib/postgresql/*/bin/initdb"):
+        return True
+    say("Postgres is not installed; installing the distribution's package")
+    prefix = [] if os.geteuid() == 0 else ["sudo", "-n"]
+    if not shutil.which("apt-get") or (prefix and not shutil.which("sudo")):
+        say("error: cannot install packages here")
+        say("hint: install the Postgres server, or set IGN_POSTGRES_BIN to the folder that holds initdb and postgres")
+        return False
+    apt = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-q"]
+    if run(*apt, "update") and run(*apt, "install", "-y", "--no-install-recommends", "postgresql"):
+        return True
+    say("hint: run as root or with passwordless sudo, or install the package postgresql yourself")
+    return False
+
+
+def builds_without_torch():
+    """The tool and the coordinator name no torch crate and build where there is no libtorch."""
+    tree = subprocess.run(
+        ["cargo", "tree", "--locked", "--edges", "normal,build", "--prefix", "none", *NO_TORCH],
+        cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False,
+    )
+    crates = {line.split()[0] for line in tree.stdout.splitlines() if line}
+    if tree.returncode != 0 or not crates:
+        say("error: cargo tree failed")
+        return False
+    if torch := crates & {"tch", "torch-sys", "ign-nets"}:
+        say(f"error: ignctl or ign-coordinator depends on {', '.join(sorted(torch))}")
+        return False
+    return run("cargo", "build", "--locked", *NO_TORCH, env={"LIBTORCH": "/nonexistent", "LIBTORCH_USE_PYTORCH": "0"})
+
+
+def run_tests():
+    """All tests; passed and failed."""
+    # The binaries that end-to-end tests start are built by the same command and profile as the tests.
+    if not run("cargo", "build", "--locked", "--workspace", "--all-targets"):
+        return 0, 1
+    command = ["cargo", "test", "--locked", "--workspace", "--no-fail-fast"]
+    say("$ " + " ".join(command))
+    passed = failed = 0
+    # Idle OpenMP threads of parallel tests would spin against each other.
+    env = {"OMP_NUM_THREADS": "1", **os.environ}
+    with subprocess.Popen(command, cwd=ROOT, env=env, stdout=subprocess.PIPE, text=True, errors="replace") as tests:
+        for line in tests.stdout:
+            print(line, end="", flush=True)
+            if result := RESULT.match(line):
+                passed += int(result[1])
+                failed += int(result[2])
+    # A test binary that was killed prints no result.
+    if tests.returncode != 0 and failed == 0:
+        failed = 1
+    return passed, failed
+
+
+def main():
+    started = time.monotonic()
+    steps = [
+        ("Postgres", install_postgres()),
+        ("libtorch", run("worker/setup-libtorch.sh")),
+        ("formats", run("cargo", "fmt", "--all", "--check")),
+        ("lints", run("cargo", "clippy", "--locked", "--workspace", "--all-targets", "--", "-D", "warnings")),
+    ]
+    passed, failed = run_tests()
+    steps.append(("building without libtorch", builds_without_torch()))
+    for name, good in steps:
+        if not good:
+            say(f"error: {name} failed")
+            failed += 1
+    if passed == 0:
+        failed = max(failed, 1)
+    say(f"finished after {(time.monotonic() - started) / 60:.1f} min")
+    print(f"{passed} passed, {failed} failed", flush=True)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

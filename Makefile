@@ -1,0 +1,58 @@
+# What the README names. Every target prints the commands that it runs; all of them work in plain sh.
+#
+#   make bake                       bake a generated demo capture, embedded: no service, no account, no GPU needed
+#   make bake CAPTURE=dir [OBJECT=collection/object] [PRESET=standard|paper] [OUT=dir] [ARGS="--size 128 ..."]
+#   make test                       everything: formats, lints, all tests; ends with "N passed, N failed"
+#   make lint                       formats and lints alone
+#   make setup                      libtorch into the per-user cache, linked as .libtorch
+#   make bench                      reserved for the benchmarks of speed against error
+
+.POSIX:
+.PHONY: bake test lint bench setup build
+
+CARGO = cargo
+# One profile serves baking and testing: the numeric code is optimised in it, and nothing is compiled twice.
+BIN = $${CARGO_TARGET_DIR:-target}/debug
+
+CAPTURE =
+OBJECT =
+PRESET = standard
+OUT =
+ARGS =
+# The demo finishes within four minutes on two cores.
+DEMO_ARGS = --size 128 --budget-secs 120
+
+bake: build
+	@set -eu; bin=$(BIN); capture='$(CAPTURE)'; object='$(OBJECT)'; out='$(OUT)'; limits=; \
+	if [ -z "$$capture" ]; then \
+		capture=bake-out/demo-capture; object=$${object:-demo/vase}; limits='$(DEMO_ARGS)'; \
+		if [ ! -e "$$capture/test.txt" ]; then \
+			echo "bake: generating a demo capture in $$capture"; \
+			rm -rf "$$capture"; mkdir -p bake-out; \
+			"$$bin/ign-worker" demo-capture "$$capture"; \
+		fi; \
+	fi; \
+	if [ -z "$$object" ]; then \
+		name=$$(basename "$$capture" | tr 'A-Z' 'a-z' | tr -c 'a-z0-9\n' '-' | sed 's/^-*//; s/-*$$//'); \
+		object=local/$${name:-object}; \
+	fi; \
+	out=$${out:-bake-out/$${object#*/}}; \
+	echo "bake: $$capture as $$object, preset $(PRESET), into $$out"; \
+	IGN_DATA=$${IGN_DATA:-bake-out/data} "$$bin/ignctl" bake "$$capture" --object "$$object" \
+		--preset '$(PRESET)' --out "$$out" $$limits $(ARGS)
+
+build: setup
+	$(CARGO) build --locked -p ignctl -p ign-coordinator -p ign-worker
+
+test:
+	python3 .ci/test.py
+
+lint: setup
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy --workspace --all-targets --locked -- -D warnings
+
+bench:
+	@echo 'bench: no benchmarks yet; the name is reserved'
+
+setup:
+	worker/setup-libtorch.sh
