@@ -6,7 +6,7 @@
 
 use rayon::prelude::ParallelIterator;
 
-use crate::raster::{Projected, covered};
+use crate::raster::Projected;
 use crate::{Camera, Mesh};
 
 /// Covered share of each cell of a grid `group` times finer than the camera's pixels.
@@ -31,9 +31,16 @@ pub fn coverage_map(mesh: &Mesh, camera: &Camera, group: u32, samples_per_group:
     let share = 1.0 / (samples * samples) as f32;
     bins.bands(&mut cells, width)
         .for_each_init(Vec::new, |hit, (band, cells)| {
+            let rows = bins.rows(band);
+            let row_samples = width * samples;
+            hit.clear();
             hit.resize(cells.len() * samples * samples, false);
-            covered(&scene, &bins, band, samples, width, hit);
-            for (row, line) in hit.chunks_exact(width * samples).enumerate() {
+            bins.for_each_triangle(band, |triangle| {
+                scene.scan(triangle, samples, width, &rows, |row, column, _| {
+                    hit[(row - rows.start * samples) * row_samples + column] = true;
+                });
+            });
+            for (row, line) in hit.chunks_exact(row_samples).enumerate() {
                 let cells = &mut cells[row / samples * width..][..width];
                 for (cell, samples) in cells.iter_mut().zip(line.chunks_exact(samples)) {
                     *cell += samples.iter().filter(|hit| **hit).count() as f32;
@@ -44,4 +51,68 @@ pub fn coverage_map(mesh: &Mesh, camera: &Camera, group: u32, samples_per_group:
             }
         });
     cells
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{CameraIntrinsics, GBuffer};
+    use glam::{DAffine3, DVec2};
+
+    fn scene() -> (Mesh, Camera) {
+        let intrinsics = CameraIntrinsics {
+            fx: 20.0,
+            fy: 22.0,
+            cx: 9.3,
+            cy: 3.1,
+            width: 13,
+            height: 7,
+        };
+        let camera = Camera::new(intrinsics, DAffine3::IDENTITY).expect("valid");
+        let at = |x: f64, y: f64| camera.unproject(DVec2::new(x, y), 2.0);
+        // A rectangle from (2.25, 1.5) to (9.125, 5.0).
+        let positions = vec![at(2.25, 1.5), at(9.125, 1.5), at(9.125, 5.0), at(2.25, 5.0)];
+        (
+            Mesh::new(positions, vec![[0, 1, 2], [0, 2, 3]]).expect("valid"),
+            camera,
+        )
+    }
+
+    #[test]
+    fn cells_hold_the_covered_share_of_their_area() {
+        let (mesh, camera) = scene();
+        for (group, samples) in [(1, 8), (2, 4), (3, 5)] {
+            let cells = coverage_map(&mesh, &camera, group, samples);
+            assert_eq!(cells.len(), (13 * group * 7 * group) as usize);
+            let side = 1.0 / f64::from(group);
+            for (index, cell) in cells.iter().enumerate() {
+                let (column, row) = (index as u32 % (13 * group), index as u32 / (13 * group));
+                let overlap = |low: f64, high: f64, place: u32| {
+                    let start = f64::from(place) * side;
+                    ((start + side).min(high) - start.max(low)).max(0.0) / side
+                };
+                let area = overlap(2.25, 9.125, column) * overlap(1.5, 5.0, row);
+                // A straight edge is off by less than half a sample along each axis.
+                assert!(
+                    (f64::from(*cell) - area).abs() <= 1.0 / f64::from(samples),
+                    "{group} {column} {row}"
+                );
+            }
+        }
+        // Where the edges fall between samples, the shares are exact.
+        assert_eq!(coverage_map(&mesh, &camera, 1, 8)[13 + 2], 0.75 * 0.5);
+    }
+
+    #[test]
+    fn groups_of_one_agree_with_the_g_buffer_and_zero_counts_as_one() {
+        let (mesh, camera) = scene();
+        assert_eq!(
+            coverage_map(&mesh, &camera, 1, 4),
+            GBuffer::render(&mesh, &camera, 4).coverage
+        );
+        assert_eq!(
+            coverage_map(&mesh, &camera, 0, 0),
+            coverage_map(&mesh, &camera, 1, 1)
+        );
+    }
 }

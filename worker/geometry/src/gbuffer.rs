@@ -4,7 +4,7 @@
 use glam::{DVec2, DVec3};
 use rayon::prelude::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
 
-use crate::raster::{Projected, clear, keep_nearest, key_triangle};
+use crate::raster::{Projected, key_triangle, nearest};
 use crate::{Camera, Mesh};
 
 /// Maps of one view, row-major, `height * width` entries each. Outside `mask` everything is zero.
@@ -34,6 +34,8 @@ pub struct GBuffer {
     pub normal_fd: Vec<[f32; 3]>,
     /// Direction, in world axes, in which the viewing ray leaves the surface when reflected about `normal`; unit.
     pub reflection: Vec<[f32; 3]>,
+    /// The triangle that the attributes come from.
+    pub triangle: Vec<u32>,
 }
 
 /// One pixel while it is drawn.
@@ -44,6 +46,7 @@ struct Pixel {
     position: [f32; 3],
     normal: [f32; 3],
     reflection: [f32; 3],
+    triangle: u32,
 }
 
 impl GBuffer {
@@ -72,61 +75,34 @@ impl GBuffer {
         bins.bands(&mut pixels, width).for_each_init(
             || (Vec::new(), Vec::new()),
             |(keys, centers), (band, pixels)| {
-                let rows = bins.rows(band);
-                let row_samples = width * samples;
-                clear(keys, pixels.len() * samples * samples);
-                clear(centers, pixels.len());
-                bins.for_each_triangle(band, |triangle| {
-                    for piece in scene.pieces(triangle) {
-                        piece.scan(
-                            samples,
-                            width,
-                            rows.clone(),
-                            |row, column, inverse_depth| {
-                                let key =
-                                    &mut keys[(row - rows.start * samples) * row_samples + column];
-                                keep_nearest(key, inverse_depth, triangle);
-                            },
-                        );
-                        if grids.len() > 1 {
-                            piece.scan(1, width, rows.clone(), |row, column, inverse_depth| {
-                                keep_nearest(
-                                    &mut centers[(row - rows.start) * width + column],
-                                    inverse_depth,
-                                    triangle,
-                                );
-                            });
-                        }
-                    }
-                });
+                nearest(&scene, &bins, band, samples, width, keys);
+                let top = bins.rows(band).start;
+                if grids.len() > 1 {
+                    nearest(&scene, &bins, band, 1, width, centers);
+                }
                 for (index, pixel) in pixels.iter_mut().enumerate() {
                     let (row, column) = (index / width, index % width);
-                    let corner = row * samples * row_samples + column * samples;
-                    let key = |(x, y): (usize, usize)| keys[corner + y * row_samples + x];
-                    let count = order
-                        .iter()
-                        .filter(|sample| key_triangle(key(**sample)).is_some())
-                        .count();
+                    let block = Block {
+                        keys,
+                        samples,
+                        row_samples: width * samples,
+                        row,
+                        column,
+                    };
+                    let count = block.count();
                     if count == 0 {
                         continue;
                     }
-                    let corner = DVec2::new(column as f64, (rows.start + row) as f64);
-                    let center =
-                        key_triangle(centers[index]).map(|triangle| (triangle, DVec2::splat(0.5)));
-                    let nearest = center.or_else(|| {
-                        let sample = order
-                            .iter()
-                            .find(|sample| key_triangle(key(**sample)).is_some())?;
-                        let offset = DVec2::new(sample.0 as f64 + 0.5, sample.1 as f64 + 0.5)
-                            / samples as f64;
-                        Some((key_triangle(key(*sample))?, offset))
-                    });
-                    if let Some((triangle, offset)) = nearest
+                    let center = centers.get(index).copied().and_then(key_triangle);
+                    let place = center.map(|triangle| (triangle, DVec2::splat(0.5)));
+                    let corner = DVec2::new(column as f64, (top + row) as f64);
+                    if let Some((triangle, offset)) = place.or_else(|| block.first(&order))
                         && let Some(attributes) =
                             attributes(mesh, &scene, triangle, corner + offset, eye)
                     {
+                        let coverage = count as f32 / (samples * samples) as f32;
                         *pixel = Pixel {
-                            coverage: count as f32 / (samples * samples) as f32,
+                            coverage,
                             ..attributes
                         };
                     }
@@ -144,9 +120,47 @@ impl GBuffer {
             position: pixels.iter().map(|pixel| pixel.position).collect(),
             normal: pixels.iter().map(|pixel| pixel.normal).collect(),
             reflection: pixels.iter().map(|pixel| pixel.reflection).collect(),
+            triangle: pixels.iter().map(|pixel| pixel.triangle).collect(),
             mask,
             normal_fd,
         }
+    }
+}
+
+/// The samples of one pixel of a band.
+struct Block<'a> {
+    keys: &'a [u64],
+    samples: usize,
+    row_samples: usize,
+    row: usize,
+    column: usize,
+}
+
+impl Block<'_> {
+    /// Number of covered samples.
+    fn count(&self) -> usize {
+        let covered = |y: usize| {
+            let line = &self.keys[self.index((0, y))..][..self.samples];
+            line.iter()
+                .filter(|key| key_triangle(**key).is_some())
+                .count()
+        };
+        (0..self.samples).map(covered).sum()
+    }
+
+    /// Triangle and place within the pixel of the first covered sample in `order`.
+    fn first(&self, order: &[(usize, usize)]) -> Option<(u32, DVec2)> {
+        order.iter().find_map(|&(x, y)| {
+            let triangle = key_triangle(self.keys[self.index((x, y))])?;
+            Some((
+                triangle,
+                DVec2::new(x as f64 + 0.5, y as f64 + 0.5) / self.samples as f64,
+            ))
+        })
+    }
+
+    fn index(&self, (x, y): (usize, usize)) -> usize {
+        (self.row * self.samples + y) * self.row_samples + self.column * self.samples + x
     }
 }
 
@@ -196,6 +210,7 @@ fn attributes(
         position: position.as_vec3().to_array(),
         normal: normal.as_vec3().to_array(),
         reflection: reflection.as_vec3().to_array(),
+        triangle,
     })
 }
 

@@ -62,29 +62,14 @@ pub fn rasterize(mesh: &Mesh, camera: &Camera) -> Raster {
     let mut pixels = vec![(0.0_f32, NO_TRIANGLE); width * height];
     bins.bands(&mut pixels, width)
         .for_each_init(Vec::new, |keys, (band, pixels)| {
-            clear(keys, pixels.len());
-            let first_row = bins.rows(band).start;
-            bins.for_each_triangle(band, |triangle| {
-                for piece in scene.pieces(triangle) {
-                    piece.scan(1, width, bins.rows(band), |row, column, inverse_depth| {
-                        keep_nearest(
-                            &mut keys[(row - first_row) * width + column],
-                            inverse_depth,
-                            triangle,
-                        );
-                    });
-                }
-            });
+            let rows = bins.rows(band);
+            nearest(&scene, &bins, band, 1, width, keys);
             for (index, (pixel, key)) in pixels.iter_mut().zip(keys.iter()).enumerate() {
                 if let Some(triangle) = key_triangle(*key) {
-                    let px = DVec2::new(
-                        (index % width) as f64 + 0.5,
-                        (first_row + index / width) as f64 + 0.5,
-                    );
-                    let depth = scene
-                        .surface(triangle, px)
-                        .map_or(0.0, |(_, depth)| depth as f32);
-                    *pixel = (depth, triangle);
+                    let place =
+                        DVec2::new((index % width) as f64, (rows.start + index / width) as f64);
+                    let surface = scene.surface(triangle, place + 0.5);
+                    *pixel = (surface.map_or(0.0, |(_, depth)| depth as f32), triangle);
                 }
             }
         });
@@ -130,15 +115,36 @@ fn weights([a, b, c]: [DVec3; 3], ray: DVec3) -> Option<[f64; 3]> {
         .then(|| clamped.map(|weight| weight / sum))
 }
 
-/// Empties a key buffer for `samples` samples.
-pub(crate) fn clear(keys: &mut Vec<u64>, samples: usize) {
+/// Fills `keys` with the nearest triangle at each sample of a band; samples lie row-major, `width * samples` a row.
+pub(crate) fn nearest(
+    scene: &Projected<'_>,
+    bins: &Bins,
+    band: usize,
+    samples: usize,
+    width: usize,
+    keys: &mut Vec<u64>,
+) {
+    let rows = bins.rows(band);
+    let row_samples = width * samples;
     keys.clear();
-    keys.resize(samples, u64::MAX);
+    keys.resize(rows.len() * samples * row_samples, u64::MAX);
+    bins.for_each_triangle(band, |triangle| {
+        scene.scan(
+            triangle,
+            samples,
+            width,
+            &rows,
+            |row, column, inverse_depth| {
+                let key = &mut keys[(row - rows.start * samples) * row_samples + column];
+                keep_nearest(key, inverse_depth, triangle);
+            },
+        );
+    });
 }
 
 /// Depth test. A key orders by nearness (bits of a positive float order like the float), then by triangle index.
 #[inline]
-pub(crate) fn keep_nearest(key: &mut u64, inverse_depth: f64, triangle: u32) {
+fn keep_nearest(key: &mut u64, inverse_depth: f64, triangle: u32) {
     let candidate = (u64::from(!(inverse_depth as f32).to_bits()) << 32) | u64::from(triangle);
     *key = candidate.min(*key);
 }
@@ -229,27 +235,35 @@ impl<'a> Projected<'a> {
         Some((weights, depth))
     }
 
-    /// What of a triangle lies in front of the near plane, as triangles on the screen.
-    pub(crate) fn pieces(&self, triangle: u32) -> impl Iterator<Item = Piece> {
-        self.screen_triangles(triangle)
-            .into_iter()
-            .flatten()
-            .filter_map(Piece::new)
+    /// Calls `put(row, column, 1/depth)` for each sample that a triangle covers, within the pixel rows `rows` of an
+    /// image `width` pixels wide, on a grid of `samples` x `samples` samples a pixel; rows and columns are those of
+    /// samples.
+    #[inline]
+    pub(crate) fn scan(
+        &self,
+        triangle: u32,
+        samples: usize,
+        width: usize,
+        rows: &Range<usize>,
+        mut put: impl FnMut(usize, usize, f64),
+    ) {
+        self.for_each_screen_triangle(triangle, |screen| {
+            scan(screen, samples, width, rows, &mut put);
+        });
     }
 
-    fn screen_triangles(&self, triangle: u32) -> [Option<[ScreenPoint; 3]>; 2] {
-        let corners = self.mesh.triangles[triangle as usize];
-        let Some(corners) = self.existing(corners) else {
-            return [None, None];
+    /// Calls `each` with what of a triangle lies in front of the near plane, as triangles on the screen.
+    #[inline]
+    fn for_each_screen_triangle(&self, triangle: u32, mut each: impl FnMut(&[ScreenPoint; 3])) {
+        let Some(corners) = self.existing(self.mesh.triangles[triangle as usize]) else {
+            return;
         };
         let screen = corners.map(|corner| self.screen[corner]);
         if screen.iter().all(|point| point.inverse_depth > 0.0) {
-            return [Some(screen), None];
+            each(&screen);
+        } else if !screen.iter().any(|point| point.inverse_depth.is_nan()) {
+            self.clipped(corners).iter().flatten().for_each(each);
         }
-        if screen.iter().any(|point| point.inverse_depth.is_nan()) {
-            return [None, None];
-        }
-        self.clipped(corners)
     }
 
     fn existing(&self, corners: [u32; 3]) -> Option<[usize; 3]> {
@@ -261,6 +275,7 @@ impl<'a> Projected<'a> {
     }
 
     /// Sutherland-Hodgman against the near plane: up to four corners, as a fan.
+    #[cold]
     fn clipped(&self, corners: [usize; 3]) -> [Option<[ScreenPoint; 3]>; 2] {
         let mut polygon = Vec::with_capacity(4);
         for (index, &corner) in corners.iter().enumerate() {
@@ -302,10 +317,9 @@ impl<'a> Projected<'a> {
                 for index in 0..triangles.len() {
                     let triangle = (chunk * BIN_CHUNK + index) as u32;
                     let mut touched = 0..0;
-                    for screen in self.screen_triangles(triangle).into_iter().flatten() {
+                    self.for_each_screen_triangle(triangle, |screen| {
                         for &samples in grids {
-                            let (columns, rows) =
-                                sample_box(&screen, samples, width, 0..height * samples);
+                            let (columns, rows) = sample_box(screen, samples, width, &(0..height));
                             if columns.is_empty() || rows.is_empty() {
                                 continue;
                             }
@@ -317,7 +331,7 @@ impl<'a> Projected<'a> {
                                 first.min(touched.start)..last.max(touched.end)
                             };
                         }
-                    }
+                    });
                     for bin in &mut bins[touched] {
                         bin.push(triangle);
                     }
@@ -365,33 +379,47 @@ impl Bins {
     }
 }
 
-/// Columns and rows of the samples that a triangle's bounding box may hold, within the image and `rows`.
+/// Columns and rows of the samples that a triangle's bounding box may hold, within the image and the pixel rows
+/// `rows`. May hold a few that the triangle does not cover: the edge functions decide.
 fn sample_box(
-    screen: &[ScreenPoint; 3],
+    [a, b, c]: &[ScreenPoint; 3],
     samples: usize,
     width: usize,
-    rows: Range<usize>,
+    rows: &Range<usize>,
 ) -> (Range<usize>, Range<usize>) {
-    let [a, b, c] = screen;
+    let scale = samples as f64;
+    // Sample i lies at i + 0.5: it is at or above `low` from ceil(low - 0.5) on, at or below `high` up to
+    // floor(high - 0.5). A cast cuts off like floor, and sends what is too small (or NaN) to 0; both are many times
+    // cheaper than the library's rounding.
     let range = |low: f64, high: f64, limits: Range<usize>| {
-        let first = (low * samples as f64 - 0.5 - BOX_SLACK)
-            .ceil()
-            .max(limits.start as f64);
-        let end = ((high * samples as f64 - 0.5 + BOX_SLACK).floor() + 1.0).min(limits.end as f64);
-        if first < end {
-            first as usize..end as usize
-        } else {
-            0..0
-        }
+        let first = upper(low * scale + (0.5 - BOX_SLACK), limits.start as f64) as usize;
+        let end = lower(high * scale + (0.5 + BOX_SLACK), limits.end as f64) as usize;
+        first..end
     };
     (
         range(
-            a.x.min(b.x).min(c.x),
-            a.x.max(b.x).max(c.x),
+            lower(lower(a.x, b.x), c.x),
+            upper(upper(a.x, b.x), c.x),
             0..width * samples,
         ),
-        range(a.y.min(b.y).min(c.y), a.y.max(b.y).max(c.y), rows),
+        range(
+            lower(lower(a.y, b.y), c.y),
+            upper(upper(a.y, b.y), c.y),
+            rows.start * samples..rows.end * samples,
+        ),
     )
+}
+
+/// `f64::min` without its care for NaN, which is a third of the cost of a small triangle.
+#[inline]
+fn lower(a: f64, b: f64) -> f64 {
+    if a < b { a } else { b }
+}
+
+/// `f64::max`, likewise.
+#[inline]
+fn upper(a: f64, b: f64) -> f64 {
+    if a > b { a } else { b }
 }
 
 /// One edge; positive on the inner side.
@@ -401,8 +429,9 @@ struct Edge {
     y: f64,
     dx: f64,
     dy: f64,
-    /// Whether a sample exactly on the edge is inside.
-    inclusive: bool,
+    /// A sample is inside when its value is above this: 0, or the largest number below 0 for an edge that also owns
+    /// the samples exactly on it.
+    threshold: f64,
 }
 
 impl Edge {
@@ -412,162 +441,337 @@ impl Edge {
         let swap = (b.x, b.y) < (a.x, a.y);
         let (from, to, sign) = if swap { (b, a, -1.0) } else { (a, b, 1.0) };
         let (dx, dy) = (sign * (to.x - from.x), sign * (to.y - from.y));
+        let owns = dy < 0.0 || (dy == 0.0 && dx > 0.0);
         Self {
             x: from.x,
             y: from.y,
             dx,
             dy,
-            inclusive: dy < 0.0 || (dy == 0.0 && dx > 0.0),
+            threshold: if owns { -f64::from_bits(1) } else { 0.0 },
         }
     }
 
+    #[inline]
     fn value(&self, x: f64, y: f64) -> f64 {
         self.dx * (y - self.y) - self.dy * (x - self.x)
     }
 
+    #[inline]
     fn holds(&self, x: f64, y: f64) -> bool {
-        let value = self.value(x, y);
-        value > 0.0 || (value == 0.0 && self.inclusive)
+        self.value(x, y) > self.threshold
     }
 }
 
-/// A triangle on the screen, ready to be drawn.
-pub(crate) struct Piece {
-    screen: [ScreenPoint; 3],
-    edges: [Edge; 3],
-    /// 1/depth is affine on the screen: its value at the first corner, and its slopes.
-    slope_x: f64,
-    slope_y: f64,
-    /// 1/depth of the farthest and nearest corner: keeps slivers, whose slopes are all rounding, within bounds.
-    bounds: (f64, f64),
+/// Draws one triangle that lies wholly in front of the near plane; see [`Projected::scan`].
+#[inline]
+fn scan(
+    screen: &[ScreenPoint; 3],
+    samples: usize,
+    width: usize,
+    rows: &Range<usize>,
+    put: &mut impl FnMut(usize, usize, f64),
+) {
+    let (columns, rows) = sample_box(screen, samples, width, rows);
+    if columns.is_empty() || rows.is_empty() {
+        return;
+    }
+    // From here on in units of samples: sample i lies exactly at i + 0.5. Scaling moves a vertex by a rounding, but
+    // for all its triangles alike.
+    let scale = samples as f64;
+    let [a, mut b, mut c] = screen.map(|point| ScreenPoint {
+        x: point.x * scale,
+        y: point.y * scale,
+        ..point
+    });
+    let area = Edge::new(a, b).value(c.x, c.y);
+    if area == 0.0 || area.is_nan() {
+        return;
+    }
+    if area < 0.0 {
+        std::mem::swap(&mut b, &mut c);
+    }
+    let edges = [Edge::new(a, b), Edge::new(b, c), Edge::new(c, a)];
+    // 1/depth is affine on the screen. The bounds keep slivers, whose slopes are all rounding, on the triangle.
+    let (ux, uy, u) = (b.x - a.x, b.y - a.y, b.inverse_depth - a.inverse_depth);
+    let (vx, vy, v) = (c.x - a.x, c.y - a.y, c.inverse_depth - a.inverse_depth);
+    let per_area = (ux * vy - uy * vx).recip();
+    let finite = |slope: f64| if slope.is_finite() { slope } else { 0.0 };
+    let slope_x = finite((u * vy - v * uy) * per_area);
+    let slope_y = finite((v * ux - u * vx) * per_area);
+    let farthest = lower(lower(a.inverse_depth, b.inverse_depth), c.inverse_depth);
+    let nearest = upper(upper(a.inverse_depth, b.inverse_depth), c.inverse_depth);
+    for row in rows {
+        let y = row as f64 + 0.5;
+        let row_depth = a.inverse_depth + slope_y * (y - a.y);
+        let mut emit = |column: usize, x: f64| {
+            put(
+                row,
+                column,
+                lower(upper(row_depth + slope_x * (x - a.x), farthest), nearest),
+            );
+        };
+        if columns.len() <= NARROW {
+            for column in columns.clone() {
+                let x = column as f64 + 0.5;
+                // Not short-circuiting: three comparisons cost less than one branch predicted wrongly.
+                if edges[0].holds(x, y) & edges[1].holds(x, y) & edges[2].holds(x, y) {
+                    emit(column, x);
+                }
+            }
+        } else {
+            span(&edges, &columns, y).for_each(|column| emit(column, column as f64 + 0.5));
+        }
+    }
 }
 
-impl Piece {
-    fn new(mut screen: [ScreenPoint; 3]) -> Option<Self> {
-        let area = Edge::new(screen[0], screen[1]).value(screen[2].x, screen[2].y);
-        if area < 0.0 {
-            screen.swap(1, 2);
-        } else if area == 0.0 || area.is_nan() {
-            return None;
+/// The columns of a row that a triangle covers. Along a row each edge function is monotone, in floating point too, so
+/// what is inside an edge is a half line: its end is estimated, then settled by exact tests.
+fn span(edges: &[Edge; 3], columns: &Range<usize>, y: f64) -> Range<usize> {
+    let (mut first, mut end) = (columns.start, columns.end);
+    for edge in edges {
+        let holds = |column: usize| edge.holds(column as f64 + 0.5, y);
+        let crossing = edge.x + edge.dx * (y - edge.y) / edge.dy;
+        let estimate = (crossing.max(columns.start as f64) as usize).min(columns.end);
+        if edge.dy < 0.0 {
+            let mut low = estimate;
+            while low > columns.start && holds(low - 1) {
+                low -= 1;
+            }
+            while low < columns.end && !holds(low) {
+                low += 1;
+            }
+            first = first.max(low);
+        } else if edge.dy > 0.0 {
+            let mut high = estimate;
+            while high < columns.end && holds(high) {
+                high += 1;
+            }
+            while high > columns.start && !holds(high - 1) {
+                high -= 1;
+            }
+            end = end.min(high);
+        } else if !holds(columns.start) {
+            return 0..0;
         }
-        let [a, b, c] = screen;
-        let (ux, uy, u) = (b.x - a.x, b.y - a.y, b.inverse_depth - a.inverse_depth);
-        let (vx, vy, v) = (c.x - a.x, c.y - a.y, c.inverse_depth - a.inverse_depth);
-        let determinant = ux * vy - uy * vx;
-        let slope = |numerator: f64| {
-            let slope = numerator / determinant;
-            if slope.is_finite() { slope } else { 0.0 }
+    }
+    first..end
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::CameraIntrinsics;
+    use glam::DAffine3;
+    use proptest::prelude::{Strategy, any, prop_assert, prop_assert_eq, proptest};
+
+    fn camera() -> Camera {
+        let intrinsics = CameraIntrinsics {
+            fx: 30.0,
+            fy: 33.0,
+            cx: 14.2,
+            cy: 21.7,
+            width: 37,
+            height: 29,
         };
-        let depths = [a, b, c].map(|point| point.inverse_depth);
-        Some(Self {
-            screen,
-            edges: [Edge::new(a, b), Edge::new(b, c), Edge::new(c, a)],
-            slope_x: slope(u * vy - v * uy),
-            slope_y: slope(v * ux - u * vx),
-            bounds: (
-                depths.iter().copied().fold(f64::INFINITY, f64::min),
-                depths.iter().copied().fold(0.0, f64::max),
-            ),
+        Camera::new(intrinsics, DAffine3::IDENTITY).expect("valid")
+    }
+
+    /// A quilt over the whole image: a grid of jittered vertices at random depths, two triangles a cell.
+    fn quilt() -> impl Strategy<Value = Mesh> {
+        const N: usize = 7;
+        proptest::collection::vec((-0.3..0.3, -0.3..0.3, 1.0..3.0), N * N).prop_map(|jitter| {
+            let camera = camera();
+            let positions = jitter.iter().enumerate().map(|(index, (x, y, depth))| {
+                let (column, row) = ((index % N) as f64, (index / N) as f64);
+                let px = DVec2::new((column + x) * 9.0 - 8.0, (row + y) * 7.0 - 6.0);
+                camera.unproject(px, *depth)
+            });
+            let cell = |index: usize| {
+                let corner = (index / (N - 1) * N + index % (N - 1)) as u32;
+                let n = N as u32;
+                [
+                    [corner, corner + 1, corner + n],
+                    [corner + 1, corner + n + 1, corner + n],
+                ]
+            };
+            Mesh::new(
+                positions.collect(),
+                (0..(N - 1) * (N - 1)).flat_map(cell).collect(),
+            )
+            .expect("valid")
         })
     }
 
-    /// Calls `put(row, column, 1/depth)` for each covered sample of a grid with `samples` x `samples` samples a
-    /// pixel, within the pixel rows `rows`.
-    #[inline]
-    pub(crate) fn scan(
-        &self,
-        samples: usize,
-        width: usize,
-        rows: Range<usize>,
-        mut put: impl FnMut(usize, usize, f64),
-    ) {
-        let (columns, rows) = sample_box(
-            &self.screen,
-            samples,
-            width,
-            rows.start * samples..rows.end * samples,
-        );
-        let scale = samples as f64;
-        let center = |index: usize| (index as f64 + 0.5) / scale;
-        let [anchor, ..] = self.screen;
-        for row in rows {
-            let y = center(row);
-            let inside = |column: usize| {
-                let x = center(column);
-                self.edges.iter().all(|edge| edge.holds(x, y))
-            };
-            let row_base = anchor.inverse_depth + self.slope_y * (y - anchor.y);
-            let mut emit = |column: usize| {
-                let inverse_depth = row_base + self.slope_x * (center(column) - anchor.x);
-                put(
-                    row,
-                    column,
-                    inverse_depth.clamp(self.bounds.0, self.bounds.1),
-                );
-            };
-            if columns.len() <= NARROW {
-                columns
-                    .clone()
-                    .filter(|column| inside(*column))
-                    .for_each(&mut emit);
-            } else {
-                self.span(columns.clone(), y, scale).for_each(&mut emit);
-            }
-        }
-    }
-
-    /// The columns of a row that the triangle covers. Along a row each edge function is monotone, in floating point
-    /// too, so what is inside an edge is a half line: its end is estimated, then settled by exact tests.
-    fn span(&self, columns: Range<usize>, y: f64, scale: f64) -> Range<usize> {
-        let (mut first, mut end) = (columns.start, columns.end);
-        let center = |index: usize| (index as f64 + 0.5) / scale;
-        for edge in &self.edges {
-            let crossing = (edge.x + edge.dx * (y - edge.y) / edge.dy) * scale - 0.5;
-            let estimate = (crossing.max(columns.start as f64) as usize).min(columns.end);
-            let holds = |column: usize| edge.holds(center(column), y);
-            if edge.dy < 0.0 {
-                let mut low = estimate;
-                while low > columns.start && holds(low - 1) {
-                    low -= 1;
-                }
-                while low < columns.end && !holds(low) {
-                    low += 1;
-                }
-                first = first.max(low);
-            } else if edge.dy > 0.0 {
-                let mut high = estimate;
-                while high < columns.end && holds(high) {
-                    high += 1;
-                }
-                while high > columns.start && !holds(high - 1) {
-                    high -= 1;
-                }
-                end = end.min(high);
-            } else if !holds(columns.start) {
-                return 0..0;
-            }
-        }
-        first..end.max(first)
-    }
-}
-
-/// Whether any sample of a band is covered is all that coverage needs; see [`crate::coverage_map`].
-pub(crate) fn covered(
-    scene: &Projected<'_>,
-    bins: &Bins,
-    band: usize,
-    samples: usize,
-    width: usize,
-    hit: &mut [bool],
-) {
-    let rows = bins.rows(band);
-    let row_samples = width * samples;
-    hit.fill(false);
-    bins.for_each_triangle(band, |triangle| {
-        for piece in scene.pieces(triangle) {
-            piece.scan(samples, width, rows.clone(), |row, column, _| {
-                hit[(row - rows.start * samples) * row_samples + column] = true;
+    fn hits(mesh: &Mesh, samples: usize) -> Vec<u32> {
+        let camera = camera();
+        let scene = Projected::new(mesh, &camera);
+        let mut hits = vec![0; 37 * 29 * samples * samples];
+        for triangle in 0..mesh.triangles.len() as u32 {
+            scene.scan(triangle, samples, 37, &(0..29), |row, column, _| {
+                hits[row * 37 * samples + column] += 1
             });
         }
-    });
+        hits
+    }
+
+    proptest! {
+        #[test]
+        fn shared_edges_leave_no_gap_and_no_overlap(mesh in quilt(), samples in 1_usize..5) {
+            prop_assert!(hits(&mesh, samples).iter().all(|count| *count == 1));
+        }
+
+        #[test]
+        fn order_of_triangles_does_not_matter(mesh in quilt(), turn in 1_usize..70, depth in 1.0..3.0) {
+            let mut soup = mesh;
+            let corners = [(-5.0, 3.0), (30.0, -8.0), (25.0, 40.0)];
+            let first = soup.positions.len() as u32;
+            soup.positions.extend(corners.map(|(x, y)| camera().unproject(DVec2::new(x, y), depth)));
+            soup.triangles.push([first, first + 1, first + 2]);
+            let before = rasterize(&soup, &camera());
+            let mut turned = soup.clone();
+            turned.triangles.rotate_left(turn);
+            let after = rasterize(&turned, &camera());
+            prop_assert_eq!(&before.depth, &after.depth);
+            for (old, new) in before.triangle.iter().zip(&after.triangle) {
+                prop_assert_eq!(soup.triangles[*old as usize], turned.triangles[*new as usize]);
+            }
+        }
+
+        #[test]
+        fn wide_and_narrow_rows_agree_with_the_edge_functions(
+            corners in proptest::array::uniform6(-20.0..60.0_f64), flip in any::<bool>(),
+        ) {
+            let [ax, ay, bx, by, cx, cy] = corners.map(|value| if flip { (value * 2.0).round() / 2.0 } else { value });
+            let point = |x, y| ScreenPoint { x, y, inverse_depth: 1.0 };
+            let mut screen = [point(ax, ay), point(bx, by), point(cx, cy)];
+            let mut drawn = vec![0; 37 * 29];
+            scan(&screen, 1, 37, &(0..29), &mut |row, column, _| drawn[row * 37 + column] += 1);
+            let area = Edge::new(screen[0], screen[1]).value(cx, cy);
+            if area < 0.0 {
+                screen.swap(1, 2);
+            }
+            for (index, drawn) in drawn.iter().enumerate() {
+                let (x, y) = ((index % 37) as f64 + 0.5, (index / 37) as f64 + 0.5);
+                let inside = (0..3).all(|i| Edge::new(screen[i], screen[(i + 1) % 3]).holds(x, y));
+                prop_assert_eq!(*drawn, i32::from(inside && area != 0.0));
+            }
+        }
+    }
+
+    #[test]
+    fn corners_exactly_on_samples_belong_to_one_triangle() {
+        // A fan around a vertex that projects exactly onto a pixel centre.
+        let intrinsics = CameraIntrinsics {
+            fx: 8.0,
+            fy: 8.0,
+            cx: 4.5,
+            cy: 4.5,
+            width: 37,
+            height: 29,
+        };
+        let camera = Camera::new(intrinsics, DAffine3::IDENTITY).expect("valid");
+        let at = |x: f64, y: f64| camera.unproject(DVec2::new(x, y), 2.0);
+        let ring = [at(1.5, 1.5), at(8.5, 1.5), at(8.5, 8.5), at(1.5, 8.5)];
+        let positions = std::iter::once(at(4.5, 4.5)).chain(ring).collect();
+        let mesh =
+            Mesh::new(positions, vec![[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]]).expect("valid");
+        let raster = rasterize(&mesh, &camera);
+        let covered: Vec<usize> = (0..raster.triangle.len())
+            .filter(|i| raster.triangle[*i] != NO_TRIANGLE)
+            .collect();
+        // Left and top borders are inside, right and bottom ones are not.
+        assert_eq!(covered.len(), 7 * 7);
+        assert_eq!(covered[0], 37 + 1);
+        assert!(covered.iter().all(|index| raster.depth[*index] == 2.0));
+    }
+
+    #[test]
+    fn ties_go_to_the_lower_index() {
+        let camera = camera();
+        let at = |x: f64, y: f64| camera.unproject(DVec2::new(x, y), 2.0);
+        let positions = vec![at(0.0, 0.0), at(80.0, 0.0), at(0.0, 80.0)];
+        let mesh = Mesh::new(positions, vec![[0, 1, 2], [0, 2, 1], [1, 2, 0]]).expect("valid");
+        assert!(
+            rasterize(&mesh, &camera)
+                .triangle
+                .iter()
+                .all(|triangle| *triangle == 0)
+        );
+    }
+
+    #[test]
+    fn a_floor_that_passes_under_the_camera_is_clipped() {
+        let camera = camera();
+        // The plane y = 1, from far behind the camera to far in front.
+        let corner = |x: f64, z: f64| DVec3::new(x, 1.0, z);
+        let positions = vec![
+            corner(-900.0, -50.0),
+            corner(900.0, -50.0),
+            corner(0.0, 4000.0),
+        ];
+        let mesh = Mesh::new(positions, vec![[0, 1, 2]]).expect("valid");
+        let raster = rasterize(&mesh, &camera);
+        for row in 0..29 {
+            for column in 0..37 {
+                let index = row * 37 + column;
+                let ray = camera
+                    .intrinsics
+                    .ray(DVec2::new(column as f64 + 0.5, row as f64 + 0.5));
+                let depth = ray.y.recip();
+                if ray.y > 0.0 && depth < 1000.0 {
+                    assert!(
+                        (f64::from(raster.depth[index]) / depth - 1.0).abs() < 1e-6,
+                        "{column} {row}"
+                    );
+                } else if ray.y <= 0.0 {
+                    assert_eq!(raster.triangle[index], NO_TRIANGLE);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_not_finite_is_not_drawn() {
+        let camera = camera();
+        let at = |x: f64, y: f64| camera.unproject(DVec2::new(x, y), 2.0);
+        let mut mesh = Mesh::new(
+            vec![at(0.0, 0.0), at(80.0, 0.0), at(0.0, 80.0)],
+            vec![[0, 1, 2]],
+        )
+        .expect("valid");
+        mesh.triangles.push([0, 1, 77]);
+        assert!(
+            rasterize(&mesh, &camera)
+                .triangle
+                .iter()
+                .all(|triangle| *triangle == 0)
+        );
+        for bad in [f64::NAN, f64::INFINITY, 1e308] {
+            let mut broken = mesh.clone();
+            broken.positions[1].x = bad;
+            let raster = rasterize(&broken, &camera);
+            assert!(raster.depth.iter().all(|depth| depth.is_finite()));
+            let mut camera = camera;
+            camera.intrinsics.fx = bad;
+            assert!(
+                rasterize(&mesh, &camera)
+                    .depth
+                    .iter()
+                    .all(|depth| depth.is_finite())
+            );
+            camera.camera_from_world.translation.z = bad;
+            assert!(
+                rasterize(&mesh, &camera)
+                    .depth
+                    .iter()
+                    .all(|depth| depth.is_finite())
+            );
+        }
+        let empty = camera.with_intrinsics(CameraIntrinsics {
+            width: 0,
+            ..camera.intrinsics
+        });
+        assert!(rasterize(&mesh, &empty).depth.is_empty());
+        assert_eq!(barycentric(&mesh, &camera, 9, DVec2::ZERO), None);
+    }
 }

@@ -23,7 +23,10 @@ use crate::GBuffer;
 pub struct WarpOptions {
     /// Share of the depth: covers rounding and the curvature of the surface between samples.
     pub relative_bias: f64,
-    /// Share of a pixel's footprint: the test compares with depths sampled at most this far away.
+    /// Share of a pixel's footprint. Measured on two scanned statues at 128 pixels (views 30 to 60 degrees apart,
+    /// against depth 16 times finer): 0.25 wrongly rejects 1.2 to 1.5 % of what is visible and accepts 2.4 % of what is
+    /// hidden; 0.5: 0.5 to 0.8 % and 5 %; 1: 0.4 % and 12 %; 2: 0.2 % and 24 %. Most of what 0.5 still accepts lies
+    /// just behind the rim; less than 0.7 % of the hidden points are accepted far behind another surface.
     pub slope_footprints: f64,
     /// Lower bound of `cos` in the bias, so that a surface seen edge-on is not compared with an unbounded bias.
     pub min_cos: f64,
@@ -35,7 +38,7 @@ impl Default for WarpOptions {
     fn default() -> Self {
         Self {
             relative_bias: 1e-3,
-            slope_footprints: 1.0,
+            slope_footprints: 0.5,
             min_cos: 0.2,
             grazing_cos: 0.05,
         }
