@@ -4,10 +4,10 @@
 use glam::{DVec2, DVec3};
 use rayon::prelude::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
 
-use crate::raster::{Projected, key_triangle, nearest};
+use crate::raster::{NO_TRIANGLE, Projected, key_triangle, nearest};
 use crate::{Camera, Mesh};
 
-/// Maps of one view, row-major, `height * width` entries each. Outside `mask` everything is zero.
+/// Maps of one view, row-major, `height * width` entries each. Outside `mask` everything else is zero.
 ///
 /// Positions are f32 and meant for the normalised frame (bounding sphere of radius 1); normalise mesh and camera
 /// first.
@@ -34,7 +34,7 @@ pub struct GBuffer {
     pub normal_fd: Vec<[f32; 3]>,
     /// Direction, in world axes, in which the viewing ray leaves the surface when reflected about `normal`; unit.
     pub reflection: Vec<[f32; 3]>,
-    /// The triangle that the attributes come from.
+    /// Index of the triangle that the attributes come from; [`NO_TRIANGLE`](crate::NO_TRIANGLE) outside `mask`.
     pub triangle: Vec<u32>,
 }
 
@@ -120,7 +120,16 @@ impl GBuffer {
             position: pixels.iter().map(|pixel| pixel.position).collect(),
             normal: pixels.iter().map(|pixel| pixel.normal).collect(),
             reflection: pixels.iter().map(|pixel| pixel.reflection).collect(),
-            triangle: pixels.iter().map(|pixel| pixel.triangle).collect(),
+            triangle: pixels
+                .iter()
+                .map(|pixel| {
+                    if pixel.coverage > 0.0 {
+                        pixel.triangle
+                    } else {
+                        NO_TRIANGLE
+                    }
+                })
+                .collect(),
             mask,
             normal_fd,
         }

@@ -608,7 +608,7 @@ mod tests {
         let mut hits = vec![0; 37 * 29 * samples * samples];
         for triangle in 0..mesh.triangles.len() as u32 {
             scene.scan(triangle, samples, 37, &(0..29), |row, column, _| {
-                hits[row * 37 * samples + column] += 1
+                hits[row * 37 * samples + column] += 1;
             });
         }
         hits
@@ -682,7 +682,11 @@ mod tests {
         // Left and top borders are inside, right and bottom ones are not.
         assert_eq!(covered.len(), 7 * 7);
         assert_eq!(covered[0], 37 + 1);
-        assert!(covered.iter().all(|index| raster.depth[*index] == 2.0));
+        assert!(
+            covered
+                .iter()
+                .all(|index| (raster.depth[*index] - 2.0).abs() < 1e-6)
+        );
     }
 
     #[test]

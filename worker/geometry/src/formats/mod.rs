@@ -171,7 +171,11 @@ mod tests {
         for big in [false, true] {
             let mesh = read("b.ply", &binary(big)).expect("valid");
             assert_eq!(mesh.triangles, [[0, 1, 2], [0, 2, 3]]);
-            assert_eq!(mesh.positions[0].x, 0.1, "doubles are read as doubles");
+            assert_eq!(
+                mesh.positions[0],
+                DVec3::new(0.1, 0.0, 0.0),
+                "doubles are read as doubles"
+            );
             assert_eq!(mesh.positions[2], DVec3::new(1.0, 1.0, -3.0));
             assert_eq!(mesh.colors, None);
         }
