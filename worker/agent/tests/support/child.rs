@@ -1,0 +1,106 @@
+//! Stands in for `ign-worker exec`: plays the script in the job's recipe.
+//!
+//! The recipe is `{"script": [step, ...]}`; see `main` for the steps. Like the real child it exits when its stdin
+//! reaches its end.
+
+use std::io::{Read, Write};
+use std::path::Path;
+
+use ign_events::{Event, Failure, FailureKind, JobFile, Level, Progress};
+use serde_json::Value;
+
+fn emit(event: &Event) {
+    let mut stdout = std::io::stdout().lock();
+    writeln!(stdout, "{}", event.to_line().unwrap()).unwrap();
+    stdout.flush().unwrap();
+}
+
+fn log(message: String) {
+    emit(&Event::Log {
+        level: Level::Info,
+        message,
+    });
+}
+
+fn write_file(root: &Path, name: &str, content: &[u8]) {
+    let path = root.join(name);
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    std::fs::write(path, content).unwrap();
+}
+
+fn main() {
+    std::thread::Builder::new()
+        .spawn(|| {
+            std::io::stdin().read_to_end(&mut Vec::new()).ok();
+            std::process::abort();
+        })
+        .unwrap();
+    let job = JobFile::read(Path::new(&std::env::args().next_back().unwrap())).unwrap();
+    log(format!("pid {}", std::process::id()));
+    log(format!("threads {}", job.threads));
+    if let Some(path) = &job.checkpoint {
+        log(format!(
+            "resumed from {}",
+            std::fs::read_to_string(path).unwrap()
+        ));
+    }
+    let mut checkpoints = 0;
+    for step in job.recipe["script"].as_array().unwrap() {
+        let (name, value) = step.as_object().unwrap().iter().next().unwrap();
+        let text = value.as_str().unwrap_or_default();
+        match name.as_str() {
+            "progress" => emit(&Event::Progress(Progress {
+                stage: "effects".into(),
+                percent: value.as_f64().unwrap(),
+                eta_secs: Some(1.0),
+                error: Some(20.5),
+                message: "training".into(),
+            })),
+            "print" => println!("{text}"),
+            "eprint" => eprintln!("{text}"),
+            "read" => {
+                let path = job.capture_dir.join(text);
+                log(format!(
+                    "{text}: {}",
+                    std::fs::read_to_string(path).unwrap()
+                ));
+            }
+            "checkpoint" => {
+                checkpoints += 1;
+                let path = job.work_dir.join(format!("checkpoint-{checkpoints}"));
+                std::fs::write(&path, text).unwrap();
+                emit(&Event::Checkpoint { path: path.clone() });
+                // The child may delete what it has announced a little later.
+                std::thread::sleep(std::time::Duration::from_millis(200));
+                std::fs::remove_file(path).unwrap();
+            }
+            "sleep_ms" => {
+                std::thread::sleep(std::time::Duration::from_millis(value.as_u64().unwrap()));
+            }
+            "abort" => std::process::abort(),
+            "exit" => std::process::exit(value.as_i64().unwrap() as i32),
+            "fail" => emit(&Event::Failed(Failure {
+                kind: FailureKind::InvalidInput,
+                message: text.to_owned(),
+                at: "sparse/cameras.txt:7".into(),
+                hint: "re-export with PINHOLE".into(),
+            })),
+            "done" => {
+                let bundle = job.work_dir.join("bundle");
+                write_file(&bundle, "bundle.json", b"{}");
+                write_file(
+                    &bundle,
+                    "metrics.json",
+                    br#"{"schema":"ign.metrics/1","methods":[{"name":"ours","mse":4.5,"per_view":[]}]}"#,
+                );
+                // A file of this many bytes, so that its upload takes several requests.
+                let large: Vec<u8> = (0..value.as_u64().unwrap())
+                    .map(|i| (i % 251) as u8)
+                    .collect();
+                write_file(&bundle, "references/0007.png", &large);
+                emit(&Event::Done { bundle });
+            }
+            other => panic!("unknown step {other}"),
+        }
+    }
+}
