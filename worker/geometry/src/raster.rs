@@ -576,10 +576,11 @@ mod tests {
         Camera::new(intrinsics, DAffine3::IDENTITY).expect("valid")
     }
 
-    /// A quilt over the whole image: a grid of jittered vertices at random depths, two triangles a cell.
+    /// A quilt over the whole image: a grid of vertices at random depths, two triangles a cell; the jitter is too small
+    /// to fold it over.
     fn quilt() -> impl Strategy<Value = Mesh> {
         const N: usize = 7;
-        proptest::collection::vec((-0.3..0.3, -0.3..0.3, 1.0..3.0), N * N).prop_map(|jitter| {
+        proptest::collection::vec((-0.2..0.2, -0.2..0.2, 1.0..3.0), N * N).prop_map(|jitter| {
             let camera = camera();
             let positions = jitter.iter().enumerate().map(|(index, (x, y, depth))| {
                 let (column, row) = ((index % N) as f64, (index / N) as f64);
