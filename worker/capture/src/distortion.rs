@@ -53,7 +53,12 @@ struct ModelRow {
 }
 
 const fn row(id: i32, name: &'static str, params: usize, model: Option<CameraModel>) -> ModelRow {
-    ModelRow { id, name, params, model }
+    ModelRow {
+        id,
+        name,
+        params,
+        model,
+    }
 }
 
 /// Models without a [`CameraModel`] are known by name and length only, so that a file that holds one can be read on.
@@ -66,7 +71,12 @@ const MODELS: [ModelRow; 18] = [
     row(5, "OPENCV_FISHEYE", 8, Some(CameraModel::OpencvFisheye)),
     row(6, "FULL_OPENCV", 12, Some(CameraModel::FullOpencv)),
     row(7, "FOV", 5, None),
-    row(8, "SIMPLE_RADIAL_FISHEYE", 4, Some(CameraModel::SimpleRadialFisheye)),
+    row(
+        8,
+        "SIMPLE_RADIAL_FISHEYE",
+        4,
+        Some(CameraModel::SimpleRadialFisheye),
+    ),
     row(9, "RADIAL_FISHEYE", 5, Some(CameraModel::RadialFisheye)),
     row(10, "THIN_PRISM_FISHEYE", 12, None),
     row(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16, None),
@@ -96,7 +106,11 @@ impl ModelKind {
     }
 
     fn from_row(row: &ModelRow) -> Self {
-        Self { name: row.name, params: row.params, model: row.model }
+        Self {
+            name: row.name,
+            params: row.params,
+            model: row.model,
+        }
     }
 }
 
@@ -133,7 +147,12 @@ const RADIUS_SCANNED: f64 = 20.0;
 impl SourceCamera {
     /// From COLMAP's parameter list; `None` when the list has the wrong length.
     /// Values are taken as they are: see [`SourceCamera::fault`].
-    pub fn from_params(model: CameraModel, width: u32, height: u32, params: &[f64]) -> Option<Self> {
+    pub fn from_params(
+        model: CameraModel,
+        width: u32,
+        height: u32,
+        params: &[f64],
+    ) -> Option<Self> {
         let mut camera = Self {
             model,
             width,
@@ -174,8 +193,12 @@ impl SourceCamera {
                 | CameraModel::Fisheye,
                 [],
             ) => {}
-            (CameraModel::SimpleRadial | CameraModel::SimpleRadialFisheye, &[k]) => camera.radial[0] = k,
-            (CameraModel::Radial | CameraModel::RadialFisheye, &[k1, k2]) => camera.radial = [k1, k2, 0.0, 0.0],
+            (CameraModel::SimpleRadial | CameraModel::SimpleRadialFisheye, &[k]) => {
+                camera.radial[0] = k;
+            }
+            (CameraModel::Radial | CameraModel::RadialFisheye, &[k1, k2]) => {
+                camera.radial = [k1, k2, 0.0, 0.0];
+            }
             (CameraModel::Opencv, &[k1, k2, p1, p2]) => {
                 camera.radial = [k1, k2, 0.0, 0.0];
                 camera.tangential = [p1, p2];
@@ -195,9 +218,16 @@ impl SourceCamera {
     /// What makes this camera unusable, if anything: sizes of zero, focal lengths that are not positive and finite,
     /// other parameters that are not finite.
     pub fn fault(&self) -> Option<String> {
-        let coefficients = self.radial.iter().chain(&self.denominator).chain(&self.tangential);
+        let coefficients = self
+            .radial
+            .iter()
+            .chain(&self.denominator)
+            .chain(&self.tangential);
         if self.width == 0 || self.height == 0 {
-            Some(format!("has a picture size of {}x{}", self.width, self.height))
+            Some(format!(
+                "has a picture size of {}x{}",
+                self.width, self.height
+            ))
         } else if self.fx == 0.0 || self.fy == 0.0 {
             Some("has zero focal length".into())
         } else if !(self.fx.is_finite() && self.fy.is_finite()) {
@@ -215,7 +245,10 @@ impl SourceCamera {
 
     /// True when pixels are an affine function of rays: no distortion at all.
     pub fn is_pinhole(&self) -> bool {
-        !self.is_fisheye() && self.radial == [0.0; 4] && self.denominator == [0.0; 3] && self.tangential == [0.0; 2]
+        !self.is_fisheye()
+            && all_zero(&self.radial)
+            && all_zero(&self.denominator)
+            && all_zero(&self.tangential)
     }
 
     fn is_fisheye(&self) -> bool {
@@ -257,7 +290,10 @@ impl SourceCamera {
             u * factor + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u),
             v * factor + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v),
         );
-        let pixel = DVec2::new(self.fx * distorted.x + self.cx, self.fy * distorted.y + self.cy);
+        let pixel = DVec2::new(
+            self.fx * distorted.x + self.cx,
+            self.fy * distorted.y + self.cy,
+        );
         pixel.is_finite().then_some(pixel)
     }
 
@@ -273,10 +309,14 @@ impl SourceCamera {
     /// The s at which `s g(s)` stops growing, by scanning in small steps.
     fn folding_limit(&self) -> f64 {
         const STEPS: u32 = 8192;
-        if self.radial == [0.0; 4] && self.denominator == [0.0; 3] {
+        if all_zero(&self.radial) && all_zero(&self.denominator) {
             return f64::INFINITY;
         }
-        let end = if self.is_fisheye() { RADIUS_SCANNED.atan() } else { RADIUS_SCANNED };
+        let end = if self.is_fisheye() {
+            RADIUS_SCANNED.atan()
+        } else {
+            RADIUS_SCANNED
+        };
         let mut last = 0.0;
         for step in 1..=STEPS {
             let s = end * f64::from(step) / f64::from(STEPS);
@@ -292,22 +332,35 @@ impl SourceCamera {
     }
 }
 
+fn all_zero(values: &[f64]) -> bool {
+    values.iter().all(|&value| value == 0.0)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn parameter_lists_of_the_wrong_length_are_refused() {
-        assert!(SourceCamera::from_params(CameraModel::Radial, 10, 10, &[1.0, 2.0, 3.0, 4.0]).is_none());
-        assert!(SourceCamera::from_params(CameraModel::Pinhole, 10, 10, &[1.0, 2.0, 3.0]).is_none());
+        assert!(
+            SourceCamera::from_params(CameraModel::Radial, 10, 10, &[1.0, 2.0, 3.0, 4.0]).is_none()
+        );
+        assert!(
+            SourceCamera::from_params(CameraModel::Pinhole, 10, 10, &[1.0, 2.0, 3.0]).is_none()
+        );
         assert!(SourceCamera::from_params(CameraModel::Opencv, 10, 10, &[1.0; 8]).is_some());
     }
 
     #[test]
     fn rays_beyond_the_fold_do_not_come_back() {
         // s (1 - 0.2 s^2) grows until s = sqrt(1 / 0.6) = 1.29.
-        let camera = SourceCamera::from_params(CameraModel::SimpleRadial, 100, 80, &[50.0, 50.0, 40.0, -0.2])
-            .expect("four parameters");
+        let camera = SourceCamera::from_params(
+            CameraModel::SimpleRadial,
+            100,
+            80,
+            &[50.0, 50.0, 40.0, -0.2],
+        )
+        .expect("four parameters");
         assert!(camera.project(DVec2::new(1.2, 0.0)).is_some());
         assert!(camera.project(DVec2::new(1.4, 0.0)).is_none());
         assert!(camera.project(DVec2::new(f64::NAN, 0.0)).is_none());
@@ -315,7 +368,8 @@ mod tests {
 
     #[test]
     fn faults_are_named() {
-        let camera = |f: f64| SourceCamera::from_params(CameraModel::SimplePinhole, 8, 8, &[f, 4.0, 4.0]);
+        let camera =
+            |f: f64| SourceCamera::from_params(CameraModel::SimplePinhole, 8, 8, &[f, 4.0, 4.0]);
         let fault = |f: f64| camera(f).expect("three parameters").fault();
         assert_eq!(fault(0.0).as_deref(), Some("has zero focal length"));
         assert_eq!(fault(-1.0).as_deref(), Some("has a negative focal length"));

@@ -90,7 +90,10 @@ pub enum ImportError {
 }
 
 fn summary(faults: &[Fault]) -> String {
-    let errors: Vec<&Fault> = faults.iter().filter(|f| f.severity == Severity::Error).collect();
+    let errors: Vec<&Fault> = faults
+        .iter()
+        .filter(|f| f.severity == Severity::Error)
+        .collect();
     match errors.as_slice() {
         [] => "the capture has faults".into(),
         [only] => only.to_string(),
@@ -105,16 +108,31 @@ pub(crate) struct Faults {
 }
 
 impl Faults {
-    pub(crate) fn error(&mut self, message: impl Into<String>, at: impl Into<String>, hint: impl Into<String>) {
+    pub(crate) fn error(
+        &mut self,
+        message: impl Into<String>,
+        at: impl Into<String>,
+        hint: impl Into<String>,
+    ) {
         self.push(Severity::Error, message.into(), at.into(), hint.into());
     }
 
-    pub(crate) fn warning(&mut self, message: impl Into<String>, at: impl Into<String>, hint: impl Into<String>) {
+    pub(crate) fn warning(
+        &mut self,
+        message: impl Into<String>,
+        at: impl Into<String>,
+        hint: impl Into<String>,
+    ) {
         self.push(Severity::Warning, message.into(), at.into(), hint.into());
     }
 
     fn push(&mut self, severity: Severity, message: String, at: String, hint: String) {
-        self.list.push(Fault { severity, message, at, hint });
+        self.list.push(Fault {
+            severity,
+            message,
+            at,
+            hint,
+        });
     }
 
     pub(crate) fn extend(&mut self, faults: impl IntoIterator<Item = Fault>) {

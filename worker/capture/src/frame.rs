@@ -61,7 +61,8 @@ impl Scene {
         let scale = self.useful_scale(frame, scale);
         let intrinsics = match *frame {
             Frame::Whole { long_side } => {
-                let (width, height) = whole_size(&camera.intrinsics, long_side.max(1).saturating_mul(scale));
+                let (width, height) =
+                    whole_size(&camera.intrinsics, long_side.max(1).saturating_mul(scale));
                 camera.intrinsics.resized(width, height)
             }
             Frame::Object { size, margin } => {
@@ -79,7 +80,10 @@ impl Scene {
                 }
             }
         };
-        Camera { intrinsics, camera_from_world: camera.camera_from_world }
+        Camera {
+            intrinsics,
+            camera_from_world: camera.camera_from_world,
+        }
     }
 
     /// The factor that [`Scene::frame_camera`] uses for `scale`.
@@ -95,7 +99,9 @@ impl Scene {
                     let i = &self.views[view].camera.intrinsics;
                     f64::from(i.width.max(i.height)) / f64::from(long_side.max(1))
                 }
-                Frame::Object { size, margin } => self.window(view, margin).1 / f64::from(size.max(1)),
+                Frame::Object { size, margin } => {
+                    self.window(view, margin).1 / f64::from(size.max(1))
+                }
             })
             .collect();
         native.sort_by(f64::total_cmp);
@@ -107,7 +113,11 @@ impl Scene {
     fn window(&self, view: usize, margin: f64) -> (DVec2, f64) {
         let bounds = &self.bounds[view];
         let extent = bounds.extent();
-        let margin = if margin.is_finite() { margin.clamp(0.0, 10.0) } else { 0.0 };
+        let margin = if margin.is_finite() {
+            margin.clamp(0.0, 10.0)
+        } else {
+            0.0
+        };
         let side = (extent.max_element() * (1.0 + 2.0 * margin)).max(SMALLEST_WINDOW_PX);
         let center = (bounds.min + bounds.max) / 2.0;
         (center - DVec2::splat(side / 2.0), side)
@@ -117,6 +127,7 @@ impl Scene {
 /// Size with the longer side at `long_side`, the other in proportion, rounded.
 fn whole_size(intrinsics: &CameraIntrinsics, long_side: u32) -> (u32, u32) {
     let longest = f64::from(intrinsics.width.max(intrinsics.height));
-    let scaled = |side: u32| ((f64::from(side) * f64::from(long_side) / longest).round() as u32).max(1);
+    let scaled =
+        |side: u32| ((f64::from(side) * f64::from(long_side) / longest).round() as u32).max(1);
     (scaled(intrinsics.width), scaled(intrinsics.height))
 }

@@ -60,7 +60,9 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     }
     let settings = settings::read(dir, &mut faults);
     let proxy = find_proxy(dir, options, &settings, &mut faults);
-    let mesh = proxy.as_ref().and_then(|proxy| load_proxy(dir, proxy, &mut faults));
+    let mesh = proxy
+        .as_ref()
+        .and_then(|proxy| load_proxy(dir, proxy, &mut faults));
     let model = match colmap::locate(dir, &mut faults) {
         Some(relative) => colmap::read(dir, &relative, &mut faults),
         None => Model::default(),
@@ -71,9 +73,14 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     // Counting views makes sense only when none of them is missing for another reason.
     let views_are_complete = !faults.has_errors();
 
-    let Some(mesh) = mesh else { return Err(ImportError::Faults(faults.into_list())) };
+    let Some(mesh) = mesh else {
+        return Err(ImportError::Faults(faults.into_list()));
+    };
     let views = keep_those_that_see(candidates, &mesh, proxy.as_deref(), &mut faults);
-    let names: Vec<&str> = views.iter().map(|(view, _, _)| view.name.as_str()).collect();
+    let names: Vec<&str> = views
+        .iter()
+        .map(|(view, _, _)| view.name.as_str())
+        .collect();
     let (train, held_out) = split(&names, held_out_names.as_ref());
     if views_are_complete && !faults.has_errors() {
         check_split(&train, &held_out, &mut faults);
@@ -88,10 +95,23 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     }
 
     let points = points(&model, &views);
-    let (views, bounds) = views.into_iter().map(|(view, _, bounds)| (view, bounds)).unzip();
-    let folder = || dir.canonicalize().ok()?.file_name()?.to_str().map(str::to_owned);
+    let (views, bounds) = views
+        .into_iter()
+        .map(|(view, _, bounds)| (view, bounds))
+        .unzip();
+    let folder = || {
+        dir.canonicalize()
+            .ok()?
+            .file_name()?
+            .to_str()
+            .map(str::to_owned)
+    };
     Ok(Scene {
-        name: settings.object.clone().or_else(folder).unwrap_or_else(|| "capture".into()),
+        name: settings
+            .object
+            .clone()
+            .or_else(folder)
+            .unwrap_or_else(|| "capture".into()),
         info: CaptureInfo {
             object: settings.object,
             title: settings.title,
@@ -138,10 +158,17 @@ fn check_folder(dir: &Path, faults: &mut Faults) -> bool {
 }
 
 /// The proxy's path inside the capture: the caller's, the settings', or one of the usual names.
-fn find_proxy(dir: &Path, options: &ImportOptions, settings: &Settings, faults: &mut Faults) -> Option<PathBuf> {
+fn find_proxy(
+    dir: &Path,
+    options: &ImportOptions,
+    settings: &Settings,
+    faults: &mut Faults,
+) -> Option<PathBuf> {
     let named = match (&options.proxy, &settings.proxy) {
         (Some(path), _) => Some((path.clone(), "the chosen proxy".to_owned())),
-        (None, Some((path, line))) => Some((path.clone(), format!("{}:{line}", settings::FILE_NAME))),
+        (None, Some((path, line))) => {
+            Some((path.clone(), format!("{}:{line}", settings::FILE_NAME)))
+        }
         (None, None) => None,
     };
     if let Some((path, at)) = named {
@@ -163,7 +190,10 @@ fn find_proxy(dir: &Path, options: &ImportOptions, settings: &Settings, faults: 
         }
         return Some(path);
     }
-    let found = PROXY_NAMES.iter().map(PathBuf::from).find(|name| dir.join(name).is_file());
+    let found = PROXY_NAMES
+        .iter()
+        .map(PathBuf::from)
+        .find(|name| dir.join(name).is_file());
     if found.is_none() {
         faults.error(
             "the proxy mesh is missing",
@@ -222,7 +252,10 @@ fn check_names<'a>(model: &'a Model, faults: &mut Faults) -> Vec<&'a ModelImage>
             );
         } else if !settings::is_inside(Path::new(&image.name)) {
             faults.error(
-                format!("image {:?} has a name that points outside images/", image.name),
+                format!(
+                    "image {:?} has a name that points outside images/",
+                    image.name
+                ),
                 image.at.as_str(),
                 "names are paths below images/",
             );
@@ -246,13 +279,22 @@ fn check_photographs(
     let images = dir.join("images");
     let images_exist = images.is_dir();
     if !images_exist {
-        faults.error("the folder images/ is missing", "images/", "put the photographs there, named as in the model");
+        faults.error(
+            "the folder images/ is missing",
+            "images/",
+            "put the photographs there, named as in the model",
+        );
     }
     let masks = dir.join("masks");
     let mask_folder = masks.is_dir();
-    let has_masks = mask_folder && std::fs::read_dir(&masks).is_ok_and(|mut entries| entries.next().is_some());
+    let has_masks =
+        mask_folder && std::fs::read_dir(&masks).is_ok_and(|mut entries| entries.next().is_some());
     if mask_folder && !has_masks {
-        faults.warning("the folder masks/ is empty", "masks/", "remove it, or put one mask per photograph there");
+        faults.warning(
+            "the folder masks/ is empty",
+            "masks/",
+            "remove it, or put one mask per photograph there",
+        );
     }
     let checked: Vec<(Option<Candidate>, Faults)> = registered
         .par_iter()
@@ -275,7 +317,9 @@ fn check_photographs(
 
 fn report_unregistered(images: &Path, registered: &[&ModelImage], faults: &mut Faults) {
     let known: BTreeSet<&str> = registered.iter().map(|image| image.name.as_str()).collect();
-    let Ok(entries) = std::fs::read_dir(images) else { return };
+    let Ok(entries) = std::fs::read_dir(images) else {
+        return;
+    };
     let mut extra: Vec<String> = entries
         .filter_map(Result::ok)
         .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()))
@@ -285,7 +329,10 @@ fn report_unregistered(images: &Path, registered: &[&ModelImage], faults: &mut F
     extra.sort();
     if let Some(first) = extra.first() {
         faults.warning(
-            format!("{} files in images/ are not in the model and are left out, the first is {first}", extra.len()),
+            format!(
+                "{} files in images/ are not in the model and are left out, the first is {first}",
+                extra.len()
+            ),
             "images/",
             "nothing to do, unless COLMAP should have registered them",
         );
@@ -300,21 +347,32 @@ fn check_view(
     has_masks: bool,
     faults: &mut Faults,
 ) -> Option<Candidate> {
-    let source = match model.cameras.get(&image.camera_id) {
-        Some(source) => *source,
-        None => {
+    let source = model
+        .cameras
+        .get(&image.camera_id)
+        .copied()
+        .unwrap_or_else(|| {
             faults.error(
-                format!("image {} names camera {}, which the model does not have", image.name, image.camera_id),
+                format!(
+                    "image {} names camera {}, which the model does not have",
+                    image.name, image.camera_id
+                ),
                 image.at.as_str(),
                 "cameras and images must come from the same export",
             );
             None
-        }
-    };
+        });
     let size = source.map(|source| (source.width, source.height));
     let image_path = dir.join("images").join(&image.name);
-    let photograph_is_sound =
-        images_exist && check_picture(&image_path, &format!("images/{}", image.name), "photograph", size, image, faults);
+    let photograph_is_sound = images_exist
+        && check_picture(
+            &image_path,
+            &format!("images/{}", image.name),
+            "photograph",
+            size,
+            image,
+            faults,
+        );
     let mut mask_path = None;
     if has_masks {
         mask_path = photo::find_mask(&dir.join("masks"), &image.name);
@@ -325,7 +383,10 @@ fn check_view(
             }
             None => faults.error(
                 format!("image {} has no mask", image.name),
-                format!("masks/{}", Path::new(&image.name).with_extension("png").display()),
+                format!(
+                    "masks/{}",
+                    Path::new(&image.name).with_extension("png").display()
+                ),
                 "add it (white = object), or remove masks/ to go by the proxy's silhouette",
             ),
         }
@@ -333,14 +394,28 @@ fn check_view(
     let source = source?;
     let camera = Camera::new(pinhole(&source), image.camera_from_world).map_err(|error| {
         faults.error(
-            format!("image {} has an unusable camera: {}", image.name, error_chain(&error)),
+            format!(
+                "image {} has an unusable camera: {}",
+                image.name,
+                error_chain(&error)
+            ),
             image.at.as_str(),
             "re-export the model",
         );
     });
     let camera = camera.ok()?;
-    photograph_is_sound
-        .then(|| (View { name: image.name.clone(), camera, source, image_path, mask_path }, image.id))
+    photograph_is_sound.then(|| {
+        (
+            View {
+                name: image.name.clone(),
+                camera,
+                source,
+                image_path,
+                mask_path,
+            },
+            image.id,
+        )
+    })
 }
 
 /// The undistorted camera of a photograph: same size, focal lengths and principal point.
@@ -366,7 +441,11 @@ fn check_picture(
 ) -> bool {
     match (photo::dimensions(path), size) {
         (Ok(found), Some(size)) if found != size => {
-            let turned = if (found.1, found.0) == size { " (turned by 90 degrees?)" } else { "" };
+            let turned = if (found.1, found.0) == size {
+                " (turned by 90 degrees?)"
+            } else {
+                ""
+            };
             faults.error(
                 format!(
                     "the {what} {shown} is {}x{} pixels, its camera {} says {}x{}{turned}",
@@ -408,10 +487,17 @@ fn held_out_names<'a>(
     let from_file = read_held_out(dir, faults);
     let listed = match (from_file, &settings.held_out) {
         (Some(file), Some(list)) => {
-            let names = |list: &[(String, usize)]| list.iter().map(|(name, _)| name.clone()).collect::<BTreeSet<_>>();
+            let names = |list: &[(String, usize)]| {
+                list.iter()
+                    .map(|(name, _)| name.clone())
+                    .collect::<BTreeSet<_>>()
+            };
             if names(&file) != names(list) {
                 faults.error(
-                    format!("held-out views are named by {HELD_OUT_FILE} and {} and differ", settings::FILE_NAME),
+                    format!(
+                        "held-out views are named by {HELD_OUT_FILE} and {} and differ",
+                        settings::FILE_NAME
+                    ),
                     HELD_OUT_FILE,
                     "keep one of the two lists",
                 );
@@ -437,14 +523,17 @@ fn held_out_names<'a>(
         let at = format!("{file}:{line}");
         if known.contains(name.as_str()) {
             kept.insert(name);
-        } else if settings::is_inside(Path::new(&name)) && dir.join("images").join(&name).is_file() {
+        } else if settings::is_inside(Path::new(&name)) && dir.join("images").join(&name).is_file()
+        {
             faults.warning(
                 format!("held-out view {name} is not in the model and is left out"),
                 at,
                 "COLMAP did not register this photograph",
             );
         } else if !known.is_empty() {
-            let alike = known.iter().find(|other| Path::new(other).file_stem() == Path::new(&name).file_stem());
+            let alike = known
+                .iter()
+                .find(|other| Path::new(other).file_stem() == Path::new(&name).file_stem());
             let hint = match alike {
                 Some(alike) => format!("is {alike} meant?"),
                 None => "names are those of the model's images, one per line".into(),
@@ -459,12 +548,23 @@ fn held_out_names<'a>(
 fn read_held_out(dir: &Path, faults: &mut Faults) -> Option<Vec<(String, usize)>> {
     match std::fs::read_to_string(dir.join(HELD_OUT_FILE)) {
         Ok(text) => {
-            let lines = text.lines().zip(1..).map(|(line, number)| (line.trim().to_owned(), number));
-            Some(lines.filter(|(line, _)| !line.is_empty() && !line.starts_with('#')).collect())
+            let lines = text
+                .lines()
+                .zip(1..)
+                .map(|(line, number)| (line.trim().to_owned(), number));
+            Some(
+                lines
+                    .filter(|(line, _)| !line.is_empty() && !line.starts_with('#'))
+                    .collect(),
+            )
         }
         Err(error) if error.kind() == io::ErrorKind::NotFound => None,
         Err(error) => {
-            faults.error(format!("cannot read the file: {error}"), HELD_OUT_FILE, "one image name per line, UTF-8");
+            faults.error(
+                format!("cannot read the file: {error}"),
+                HELD_OUT_FILE,
+                "one image name per line, UTF-8",
+            );
             None
         }
     }
@@ -489,8 +589,14 @@ fn keep_those_that_see(
 ) -> Vec<SeeingView> {
     let total = candidates.len();
     let used: BTreeSet<u32> = mesh.triangles.iter().flatten().copied().collect();
-    let vertices: Vec<DVec3> = used.iter().map(|&index| mesh.positions[index as usize]).collect();
-    let sights: Vec<Sight> = candidates.par_iter().map(|(view, _)| sight(view, mesh, &vertices)).collect();
+    let vertices: Vec<DVec3> = used
+        .iter()
+        .map(|&index| mesh.positions[index as usize])
+        .collect();
+    let sights: Vec<Sight> = candidates
+        .par_iter()
+        .map(|(view, _)| sight(view, mesh, &vertices))
+        .collect();
     let mut kept = Vec::with_capacity(total);
     let mut blind = Faults::default();
     for ((view, id), sight) in candidates.into_iter().zip(sights) {
@@ -500,15 +606,27 @@ fn keep_those_that_see(
                 continue;
             }
             Sight::Behind => ("the proxy lies behind the camera", "check the view's pose"),
-            Sight::OutsidePicture => ("the proxy lies outside the picture", "check the view's pose"),
-            Sight::FromInside => ("the camera stands inside the proxy", "check the view's pose, or trim the mesh"),
+            Sight::OutsidePicture => (
+                "the proxy lies outside the picture",
+                "check the view's pose",
+            ),
+            Sight::FromInside => (
+                "the camera stands inside the proxy",
+                "check the view's pose, or trim the mesh",
+            ),
         };
-        blind.warning(format!("{message}; the view is left out"), format!("view {}", view.name), hint);
+        blind.warning(
+            format!("{message}; the view is left out"),
+            format!("view {}", view.name),
+            hint,
+        );
     }
     if kept.is_empty() && total > 0 {
         faults.error(
             format!("none of the {total} views sees the proxy"),
-            proxy.map(|path| path.display().to_string()).unwrap_or_default(),
+            proxy
+                .map(|path| path.display().to_string())
+                .unwrap_or_default(),
             "the mesh must be in the frame of the COLMAP model: same origin, axes and scale",
         );
     } else {
@@ -523,9 +641,15 @@ fn sight(view: &View, mesh: &Mesh, vertices: &[DVec3]) -> Sight {
         return Sight::FromInside;
     }
     let size = DVec2::new(f64::from(view.source.width), f64::from(view.source.height));
-    let picture = Bounds { min: DVec2::ZERO, max: size };
+    let picture = Bounds {
+        min: DVec2::ZERO,
+        max: size,
+    };
     let slack = size * BOUNDS_SLACK;
-    let mut bounds = Bounds { min: DVec2::INFINITY, max: DVec2::NEG_INFINITY };
+    let mut bounds = Bounds {
+        min: DVec2::INFINITY,
+        max: DVec2::NEG_INFINITY,
+    };
     let (mut some_in_front, mut some_behind, mut some_inside) = (false, false, false);
     for &position in vertices {
         let in_camera = view.camera.camera_from_world.transform_point3(position);
@@ -535,7 +659,9 @@ fn sight(view: &View, mesh: &Mesh, vertices: &[DVec3]) -> Sight {
         }
         some_in_front = true;
         let ray = DVec2::new(in_camera.x, in_camera.y) / in_camera.z;
-        let Some(px) = view.source.project(ray) else { continue };
+        let Some(px) = view.source.project(ray) else {
+            continue;
+        };
         if px.cmpge(-slack).all() && px.cmple(size + slack).all() {
             some_inside = true;
             let i = &view.camera.intrinsics;
@@ -558,7 +684,15 @@ fn sight(view: &View, mesh: &Mesh, vertices: &[DVec3]) -> Sight {
                 camera_from_world: view.camera.camera_from_world,
             };
             let raster = rasterize(mesh, &camera);
-            if raster.triangle.iter().any(|&triangle| triangle != NO_TRIANGLE) { Sight::Seen(picture) } else { Sight::OutsidePicture }
+            if raster
+                .triangle
+                .iter()
+                .any(|&triangle| triangle != NO_TRIANGLE)
+            {
+                Sight::Seen(picture)
+            } else {
+                Sight::OutsidePicture
+            }
         }
     }
 }
@@ -566,7 +700,9 @@ fn sight(view: &View, mesh: &Mesh, vertices: &[DVec3]) -> Sight {
 /// Whether the surface closes around `point`: its solid angle seen from there, more than half of the full sphere.
 fn encloses(mesh: &Mesh, vertices: &[DVec3], point: DVec3) -> bool {
     let corner = |pick: fn(DVec3, DVec3) -> DVec3| vertices.iter().copied().reduce(pick);
-    let (Some(min), Some(max)) = (corner(DVec3::min), corner(DVec3::max)) else { return false };
+    let (Some(min), Some(max)) = (corner(DVec3::min), corner(DVec3::max)) else {
+        return false;
+    };
     if !(point.cmpge(min).all() && point.cmple(max).all()) {
         return false;
     }
@@ -588,7 +724,9 @@ fn encloses(mesh: &Mesh, vertices: &[DVec3], point: DVec3) -> bool {
 /// Indices of training and held-out views.
 fn split(names: &[&str], held_out: Option<&BTreeSet<String>>) -> (Vec<usize>, Vec<usize>) {
     let chosen: BTreeSet<usize> = match held_out {
-        Some(listed) => (0..names.len()).filter(|&view| listed.contains(names[view])).collect(),
+        Some(listed) => (0..names.len())
+            .filter(|&view| listed.contains(names[view]))
+            .collect(),
         None => split::every_eighth(names.len()).into_iter().collect(),
     };
     (0..names.len()).partition(|view| !chosen.contains(view))
@@ -604,7 +742,9 @@ fn check_split(train: &[usize], held_out: &[usize], faults: &mut Faults) {
         );
     } else if count < FEWEST_TRAINING_VIEWS {
         faults.error(
-            format!("{count} training views are too few, at least {FEWEST_TRAINING_VIEWS} are needed"),
+            format!(
+                "{count} training views are too few, at least {FEWEST_TRAINING_VIEWS} are needed"
+            ),
             "images/",
             "take more photographs around the object, or hold out fewer",
         );
@@ -642,7 +782,9 @@ fn mean_outside_mask(view: &View, mask_is_background: bool) -> Result<Option<f64
             hint: "copy the file again: it seems to be damaged".into(),
         })
     };
-    let Some(mask_path) = &view.mask_path else { return Ok(None) };
+    let Some(mask_path) = &view.mask_path else {
+        return Ok(None);
+    };
     let photograph = decode(&view.image_path)?.into_rgb8();
     let mask = decode(mask_path)?.into_luma8();
     let outside = if mask_is_background { 255 } else { 0 };
@@ -658,9 +800,17 @@ fn mean_outside_mask(view: &View, mask_is_background: bool) -> Result<Option<f64
 
 /// The model's points with tracks in terms of the views that were kept.
 fn points(model: &Model, views: &[SeeingView]) -> Vec<Point> {
-    let view_of_image: BTreeMap<u32, usize> = views.iter().enumerate().map(|(index, &(_, id, _))| (id, index)).collect();
+    let view_of_image: BTreeMap<u32, usize> = views
+        .iter()
+        .enumerate()
+        .map(|(index, &(_, id, _))| (id, index))
+        .collect();
     let point = |point: &colmap::ModelPoint| {
-        let seen_by: BTreeSet<usize> = point.image_ids.iter().filter_map(|id| view_of_image.get(id).copied()).collect();
+        let seen_by: BTreeSet<usize> = point
+            .image_ids
+            .iter()
+            .filter_map(|id| view_of_image.get(id).copied())
+            .collect();
         Point {
             position: point.position,
             color: point.color,

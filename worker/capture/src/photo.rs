@@ -34,5 +34,7 @@ pub(crate) fn decode(path: &Path, expected: (u32, u32)) -> ImageResult<DynamicIm
 pub(crate) fn find_mask(masks: &Path, name: &str) -> Option<PathBuf> {
     let appended = masks.join(format!("{name}.png"));
     let same_stem = masks.join(Path::new(name).with_extension("png"));
-    [appended, same_stem].into_iter().find(|path| path.is_file())
+    [appended, same_stem]
+        .into_iter()
+        .find(|path| path.is_file())
 }

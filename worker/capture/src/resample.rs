@@ -49,15 +49,21 @@ impl Scene {
     /// # Errors
     /// When a file cannot be decoded or has changed its size, or the camera or the index is not usable.
     pub fn load_view(&self, view: usize, camera: &Camera) -> Result<ViewImage, ImportError> {
-        let view = self
-            .views
-            .get(view)
-            .ok_or(ImportError::NoSuchView { index: view, views: self.views.len() })?;
+        let view = self.views.get(view).ok_or(ImportError::NoSuchView {
+            index: view,
+            views: self.views.len(),
+        })?;
         camera
             .intrinsics
             .validate()
-            .map_err(|source| ImportError::Camera { view: view.name.clone(), source })?;
-        let map = PixelMap { target: camera.intrinsics, source: view.source };
+            .map_err(|source| ImportError::Camera {
+                view: view.name.clone(),
+                source,
+            })?;
+        let map = PixelMap {
+            target: camera.intrinsics,
+            source: view.source,
+        };
         let photograph = decode(view, &view.image_path)?.into_rgb8();
         let (rgb, inside) = resample::<3>(photograph.as_raw(), &map);
         drop(photograph);
@@ -65,13 +71,21 @@ impl Scene {
             Some(path) => {
                 let mut mask = decode(view, path)?.into_luma8().into_raw();
                 if self.mask_is_background {
-                    mask.iter_mut().for_each(|value| *value = 255 - *value);
+                    for value in &mut mask {
+                        *value = 255 - *value;
+                    }
                 }
                 Some(resample::<1>(&mask, &map).0)
             }
             None => None,
         };
-        Ok(ViewImage { width: camera.intrinsics.width, height: camera.intrinsics.height, rgb, mask, inside })
+        Ok(ViewImage {
+            width: camera.intrinsics.width,
+            height: camera.intrinsics.height,
+            rgb,
+            mask,
+            inside,
+        })
     }
 }
 
@@ -112,14 +126,17 @@ struct Footprint {
 impl PixelMap {
     fn at(&self, px: DVec2) -> Option<DVec2> {
         let i = &self.target;
-        self.source.project(DVec2::new((px.x - i.cx) / i.fx, (px.y - i.cy) / i.fy))
+        self.source
+            .project(DVec2::new((px.x - i.cx) / i.fx, (px.y - i.cy) / i.fy))
     }
 
     /// The box of the module's text for the pixel whose centre is `px`; `None` outside the lens model's range.
     fn footprint(&self, px: DVec2) -> Option<Footprint> {
         const HALF: DVec2 = DVec2::splat(0.5);
-        let along_x = self.at(px + DVec2::new(HALF.x, 0.0))? - self.at(px - DVec2::new(HALF.x, 0.0))?;
-        let along_y = self.at(px + DVec2::new(0.0, HALF.y))? - self.at(px - DVec2::new(0.0, HALF.y))?;
+        let along_x =
+            self.at(px + DVec2::new(HALF.x, 0.0))? - self.at(px - DVec2::new(HALF.x, 0.0))?;
+        let along_y =
+            self.at(px + DVec2::new(0.0, HALF.y))? - self.at(px - DVec2::new(0.0, HALF.y))?;
         Some(Footprint {
             center: self.at(px)?,
             width: DVec2::new(along_x.x.hypot(along_y.x), along_x.y.hypot(along_y.y)),
@@ -132,11 +149,15 @@ fn resample<const C: usize>(data: &[u8], map: &PixelMap) -> (Vec<f32>, Vec<f32>)
     let (width, height) = (map.target.width as usize, map.target.height as usize);
     let mut values = vec![0.0; width * height * C];
     let mut inside = vec![0.0; width * height];
-    let rows = values.par_chunks_mut(width * C).zip(inside.par_chunks_mut(width));
+    let rows = values
+        .par_chunks_mut(width * C)
+        .zip(inside.par_chunks_mut(width));
     rows.enumerate().for_each(|(row, (values, inside))| {
         for (column, (value, share)) in values.chunks_exact_mut(C).zip(inside).enumerate() {
             let px = DVec2::new(column as f64 + 0.5, row as f64 + 0.5);
-            let Some(footprint) = map.footprint(px) else { continue };
+            let Some(footprint) = map.footprint(px) else {
+                continue;
+            };
             *share = share_inside(&footprint, &map.source);
             if *share > 0.0 {
                 let mean = box_mean::<C>(data, &map.source, &footprint);
@@ -149,7 +170,10 @@ fn resample<const C: usize>(data: &[u8], map: &PixelMap) -> (Vec<f32>, Vec<f32>)
 
 /// The part of `center +- width / 2` that lies in `[0, size]`, as its two ends.
 fn clip(center: f64, width: f64, size: u32) -> (f64, f64) {
-    ((center - width / 2.0).max(0.0), (center + width / 2.0).min(f64::from(size)))
+    (
+        (center - width / 2.0).max(0.0),
+        (center + width / 2.0).min(f64::from(size)),
+    )
 }
 
 /// Share of the footprint that lies inside the photograph.
@@ -157,13 +181,21 @@ fn share_inside(footprint: &Footprint, source: &SourceCamera) -> f32 {
     let (x0, x1) = clip(footprint.center.x, footprint.width.x, source.width);
     let (y0, y1) = clip(footprint.center.y, footprint.width.y, source.height);
     let area = footprint.width.x * footprint.width.y;
-    if x1 <= x0 || y1 <= y0 || area <= 0.0 { 0.0 } else { ((x1 - x0) * (y1 - y0) / area).min(1.0) as f32 }
+    if x1 <= x0 || y1 <= y0 || area <= 0.0 {
+        0.0
+    } else {
+        ((x1 - x0) * (y1 - y0) / area).min(1.0) as f32
+    }
 }
 
 /// Area mean over the footprint, at least one pixel wide, of what lies inside the photograph; in [0, 1].
 fn box_mean<const C: usize>(data: &[u8], source: &SourceCamera, footprint: &Footprint) -> [f32; C] {
     let (x0, x1) = clip(footprint.center.x, footprint.width.x.max(1.0), source.width);
-    let (y0, y1) = clip(footprint.center.y, footprint.width.y.max(1.0), source.height);
+    let (y0, y1) = clip(
+        footprint.center.y,
+        footprint.width.y.max(1.0),
+        source.height,
+    );
     let stride = source.width as usize;
     let mut sum = [0.0_f64; C];
     for y in y0.floor() as usize..y1.ceil() as usize {

@@ -49,7 +49,11 @@ pub(crate) fn read(dir: &Path, faults: &mut Faults) -> Settings {
     match std::fs::read_to_string(&path) {
         Ok(text) => parse(&text, faults),
         Err(error) => {
-            faults.error(format!("cannot read the file: {error}"), FILE_NAME, "it must be UTF-8 text");
+            faults.error(
+                format!("cannot read the file: {error}"),
+                FILE_NAME,
+                "it must be UTF-8 text",
+            );
             Settings::default()
         }
     }
@@ -58,18 +62,26 @@ pub(crate) fn read(dir: &Path, faults: &mut Faults) -> Settings {
 /// A path inside the capture: relative, and nowhere upwards.
 pub(crate) fn is_inside(path: &Path) -> bool {
     let mut parts = path.components().peekable();
-    parts.peek().is_some() && parts.all(|part| matches!(part, Component::Normal(_) | Component::CurDir))
+    parts.peek().is_some()
+        && parts.all(|part| matches!(part, Component::Normal(_) | Component::CurDir))
 }
 
 fn parse(text: &str, faults: &mut Faults) -> Settings {
     let mut settings = Settings::default();
-    let line_of = |span: Range<usize>| 1 + text.as_bytes()[..span.start.min(text.len())].iter().filter(|&&b| b == b'\n').count();
+    let line_of =
+        |span: Range<usize>| 1 + text.get(..span.start).unwrap_or(text).matches('\n').count();
     let at_line = |line: usize| format!("{FILE_NAME}:{line}");
     let table = match DeTable::parse(text) {
         Ok(table) => table.into_inner(),
         Err(error) => {
-            let at = error.span().map_or_else(|| FILE_NAME.into(), |span| at_line(line_of(span)));
-            faults.error(error.message().trim_end_matches('.').to_lowercase(), at, "correct the TOML syntax");
+            let at = error
+                .span()
+                .map_or_else(|| FILE_NAME.into(), |span| at_line(line_of(span)));
+            faults.error(
+                error.message().trim_end_matches('.').to_lowercase(),
+                at,
+                "correct the TOML syntax",
+            );
             return settings;
         }
     };
@@ -77,7 +89,11 @@ fn parse(text: &str, faults: &mut Faults) -> Settings {
         let key_line = line_of(key.span());
         let value_line = line_of(value.span());
         let mut wrong = |what: &str, hint: &str| {
-            faults.error(format!("{} {what}", key.get_ref()), at_line(value_line), hint);
+            faults.error(
+                format!("{} {what}", key.get_ref()),
+                at_line(value_line),
+                hint,
+            );
         };
         let text_of = |value: &Spanned<DeValue<'_>>| value.get_ref().as_str().map(str::to_owned);
         match key.get_ref().as_ref() {
@@ -95,24 +111,40 @@ fn parse(text: &str, faults: &mut Faults) -> Settings {
             }
             "proxy" => match text_of(&value).map(PathBuf::from) {
                 Some(path) if is_inside(&path) => settings.proxy = Some((path, value_line)),
-                _ => wrong("must be the path of a file inside the capture", "for example proxy = \"mesh.ply\""),
+                _ => wrong(
+                    "must be the path of a file inside the capture",
+                    "for example proxy = \"mesh.ply\"",
+                ),
             },
             "masks" => match text_of(&value).as_deref() {
                 Some("white_is_object") => settings.mask_is_background = false,
                 Some("white_is_background") => settings.mask_is_background = true,
-                _ => wrong("has an unknown meaning", "use \"white_is_object\" or \"white_is_background\""),
+                _ => wrong(
+                    "has an unknown meaning",
+                    "use \"white_is_object\" or \"white_is_background\"",
+                ),
             },
             "metres_per_scene_unit" => match scalar(value.get_ref()) {
-                Some(metres) if metres.is_finite() && metres > 0.0 => settings.metres_per_scene_unit = Some(metres),
-                _ => wrong("must be a number above zero", "for example 0.01 where one unit is a centimetre"),
+                Some(metres) if metres.is_finite() && metres > 0.0 => {
+                    settings.metres_per_scene_unit = Some(metres);
+                }
+                _ => wrong(
+                    "must be a number above zero",
+                    "for example 0.01 where one unit is a centimetre",
+                ),
             },
             "held_out" => {
                 let names = value.get_ref().as_array().and_then(|list| {
-                    list.iter().map(|name| Some((text_of(name)?, line_of(name.span())))).collect::<Option<Vec<_>>>()
+                    list.iter()
+                        .map(|name| Some((text_of(name)?, line_of(name.span()))))
+                        .collect::<Option<Vec<_>>>()
                 });
                 match names {
                     Some(names) => settings.held_out = Some(names),
-                    None => wrong("must be a list of image names", "for example held_out = [\"IMG_0007.jpg\"]"),
+                    None => wrong(
+                        "must be a list of image names",
+                        "for example held_out = [\"IMG_0007.jpg\"]",
+                    ),
                 }
             }
             other => faults.error(
@@ -128,7 +160,9 @@ fn parse(text: &str, faults: &mut Faults) -> Settings {
 fn scalar(value: &DeValue<'_>) -> Option<f64> {
     match value {
         DeValue::Float(number) => number.as_str().replace('_', "").parse().ok(),
-        DeValue::Integer(number) if number.radix() == 10 => number.as_str().replace('_', "").parse().ok(),
+        DeValue::Integer(number) if number.radix() == 10 => {
+            number.as_str().replace('_', "").parse().ok()
+        }
         _ => None,
     }
 }
@@ -172,7 +206,14 @@ mod tests {
         places.sort();
         assert_eq!(
             places,
-            ["capture.toml:1", "capture.toml:2", "capture.toml:3", "capture.toml:4", "capture.toml:6", "capture.toml:7"]
+            [
+                "capture.toml:1",
+                "capture.toml:2",
+                "capture.toml:3",
+                "capture.toml:4",
+                "capture.toml:6",
+                "capture.toml:7"
+            ]
         );
         assert_eq!(self::places("title = 'T'\nobject =\n"), ["capture.toml:2"]);
     }

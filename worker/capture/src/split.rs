@@ -25,7 +25,10 @@ pub(crate) fn natural_order(a: &str, b: &str) -> Ordering {
         let order = if a_byte.is_ascii_digit() && b_byte.is_ascii_digit() {
             let a_digits = take_digits(&mut a_rest);
             let b_digits = take_digits(&mut b_rest);
-            a_digits.len().cmp(&b_digits.len()).then_with(|| a_digits.cmp(b_digits))
+            a_digits
+                .len()
+                .cmp(&b_digits.len())
+                .then_with(|| a_digits.cmp(b_digits))
         } else {
             (a_rest, b_rest) = (&a_rest[1..], &b_rest[1..]);
             a_byte.cmp(&b_byte)
@@ -55,7 +58,10 @@ mod tests {
     fn digits_compare_as_numbers() {
         let mut names = vec!["b1", "a10.png", "a9.png", "a09.png", "a", "a10x", "a2b3"];
         names.sort_by(|a, b| natural_order(a, b));
-        assert_eq!(names, ["a", "a2b3", "a09.png", "a9.png", "a10.png", "a10x", "b1"]);
+        assert_eq!(
+            names,
+            ["a", "a2b3", "a09.png", "a9.png", "a10.png", "a10x", "b1"]
+        );
     }
 
     #[test]

@@ -25,7 +25,11 @@ enum Stop {
 
 impl From<io::Error> for Stop {
     fn from(error: io::Error) -> Self {
-        if error.kind() == io::ErrorKind::UnexpectedEof { Self::Truncated } else { Self::Io(error) }
+        if error.kind() == io::ErrorKind::UnexpectedEof {
+            Self::Truncated
+        } else {
+            Self::Io(error)
+        }
     }
 }
 
@@ -42,12 +46,21 @@ impl Bytes {
         let open = || -> io::Result<Self> {
             let file = File::open(&source.path)?;
             let length = file.metadata()?.len();
-            Ok(Self { reader: BufReader::with_capacity(1 << 16, file), length, position: 0, record_at: 0 })
+            Ok(Self {
+                reader: BufReader::with_capacity(1 << 16, file),
+                length,
+                position: 0,
+                record_at: 0,
+            })
         };
         match open() {
             Ok(bytes) => Some(bytes),
             Err(error) => {
-                faults.error(format!("cannot read the file: {error}"), source.shown.as_str(), "check its permissions");
+                faults.error(
+                    format!("cannot read the file: {error}"),
+                    source.shown.as_str(),
+                    "check its permissions",
+                );
                 None
             }
         }
@@ -88,11 +101,18 @@ impl Bytes {
     fn count(&mut self, record_bytes: u64) -> Result<u64, Stop> {
         let count = self.u64()?;
         let left = self.length.saturating_sub(self.position);
-        if count.checked_mul(record_bytes).is_none_or(|bytes| bytes > left) { Err(Stop::Truncated) } else { Ok(count) }
+        if count
+            .checked_mul(record_bytes)
+            .is_none_or(|bytes| bytes > left)
+        {
+            Err(Stop::Truncated)
+        } else {
+            Ok(count)
+        }
     }
 
     fn skip(&mut self, bytes: u64) -> Result<(), Stop> {
-        let signed = i64::try_from(bytes).map_err(|_| Stop::Truncated)?;
+        let signed = i64::try_from(bytes).ok().ok_or(Stop::Truncated)?;
         self.reader.seek_relative(signed)?;
         self.position += bytes;
         Ok(())
@@ -111,7 +131,9 @@ impl Bytes {
                 Stop::Truncated
             });
         }
-        String::from_utf8(name).map_err(|_| Stop::Garbled("an image's name is no UTF-8 text".into()))
+        String::from_utf8(name)
+            .ok()
+            .ok_or_else(|| Stop::Garbled("an image's name is no UTF-8 text".into()))
     }
 
     fn begin_record(&mut self) {
@@ -128,31 +150,46 @@ impl Bytes {
         let again = "copy the file again, or re-export the model";
         match result {
             Ok(()) if self.position < self.length => faults.warning(
-                format!("{} bytes follow the last record", self.length - self.position),
+                format!(
+                    "{} bytes follow the last record",
+                    self.length - self.position
+                ),
                 format!("{} (byte {})", source.shown, self.position),
                 again,
             ),
             Ok(()) => {}
             Err(Stop::Truncated) => {
                 faults.error(
-                    format!("the file is truncated: it ends after {} bytes, inside {what}", self.length),
+                    format!(
+                        "the file is truncated: it ends after {} bytes, inside {what}",
+                        self.length
+                    ),
                     at,
                     again,
                 );
             }
-            Err(Stop::Io(error)) => faults.error(format!("cannot read on: {error}"), at, "check the disk"),
+            Err(Stop::Io(error)) => {
+                faults.error(format!("cannot read on: {error}"), at, "check the disk");
+            }
             Err(Stop::Garbled(message)) => faults.error(message, at, again),
         }
     }
 }
 
 pub(super) fn cameras(source: &Source, model: &mut Model, faults: &mut Faults) {
-    let Some(mut bytes) = Bytes::open(source, faults) else { return };
+    let Some(mut bytes) = Bytes::open(source, faults) else {
+        return;
+    };
     let result = read_cameras(&mut bytes, source, model, faults);
     bytes.finish(source, faults, "the list of cameras", result);
 }
 
-fn read_cameras(bytes: &mut Bytes, source: &Source, model: &mut Model, faults: &mut Faults) -> Result<(), Stop> {
+fn read_cameras(
+    bytes: &mut Bytes,
+    source: &Source,
+    model: &mut Model,
+    faults: &mut Faults,
+) -> Result<(), Stop> {
     for _ in 0..bytes.count(24)? {
         bytes.begin_record();
         let id = bytes.u32()?;
@@ -160,17 +197,31 @@ fn read_cameras(bytes: &mut Bytes, source: &Source, model: &mut Model, faults: &
         let (width, height) = (bytes.u64()?, bytes.u64()?);
         let Some(kind) = ModelKind::by_id(model_id) else {
             // The length of its parameter list is unknown, so the cameras behind it cannot be found.
-            return Err(Stop::Garbled(format!("camera {id} has the unknown model number {model_id}")));
+            return Err(Stop::Garbled(format!(
+                "camera {id} has the unknown model number {model_id}"
+            )));
         };
         let mut params = Vec::with_capacity(kind.params);
         for _ in 0..kind.params {
             params.push(bytes.f64()?);
         }
         let camera = match (u32::try_from(width), u32::try_from(height), kind.model) {
-            (Ok(width), Ok(height), Some(model)) => SourceCamera::from_params(model, width, height, &params)
-                .ok_or_else(|| (format!("has the wrong number of parameters for {}", kind.name), UNSUPPORTED_HINT)),
-            (_, _, None) => Err((format!("has the model {}, which is not supported", kind.name), UNSUPPORTED_HINT)),
-            _ => Err((format!("has a picture size of {width}x{height}"), "re-export the model")),
+            (Ok(width), Ok(height), Some(model)) => {
+                SourceCamera::from_params(model, width, height, &params).ok_or_else(|| {
+                    (
+                        format!("has the wrong number of parameters for {}", kind.name),
+                        UNSUPPORTED_HINT,
+                    )
+                })
+            }
+            (_, _, None) => Err((
+                format!("has the model {}, which is not supported", kind.name),
+                UNSUPPORTED_HINT,
+            )),
+            _ => Err((
+                format!("has a picture size of {width}x{height}"),
+                "re-export the model",
+            )),
         };
         add_camera(model, faults, id, &bytes.at(source), camera);
     }
@@ -178,12 +229,19 @@ fn read_cameras(bytes: &mut Bytes, source: &Source, model: &mut Model, faults: &
 }
 
 pub(super) fn images(source: &Source, model: &mut Model, faults: &mut Faults) {
-    let Some(mut bytes) = Bytes::open(source, faults) else { return };
+    let Some(mut bytes) = Bytes::open(source, faults) else {
+        return;
+    };
     let result = read_images(&mut bytes, source, model, faults);
     bytes.finish(source, faults, "the list of images", result);
 }
 
-fn read_images(bytes: &mut Bytes, source: &Source, model: &mut Model, faults: &mut Faults) -> Result<(), Stop> {
+fn read_images(
+    bytes: &mut Bytes,
+    source: &Source,
+    model: &mut Model,
+    faults: &mut Faults,
+) -> Result<(), Stop> {
     for _ in 0..bytes.count(4 + 56 + 4 + 1 + 8)? {
         bytes.begin_record();
         let id = bytes.u32()?;
@@ -194,20 +252,35 @@ fn read_images(bytes: &mut Bytes, source: &Source, model: &mut Model, faults: &m
         bytes.skip(points * 24)?;
         let at = bytes.at(source);
         match pose(&values) {
-            Ok(camera_from_world) => model.images.push(ModelImage { id, name, camera_id, camera_from_world, at }),
-            Err(message) => faults.error(format!("image {name} {message}"), at, "re-export the model"),
+            Ok(camera_from_world) => model.images.push(ModelImage {
+                id,
+                name,
+                camera_id,
+                camera_from_world,
+                at,
+            }),
+            Err(message) => {
+                faults.error(format!("image {name} {message}"), at, "re-export the model");
+            }
         }
     }
     Ok(())
 }
 
 pub(super) fn points(source: &Source, model: &mut Model, faults: &mut Faults) {
-    let Some(mut bytes) = Bytes::open(source, faults) else { return };
+    let Some(mut bytes) = Bytes::open(source, faults) else {
+        return;
+    };
     let result = read_points(&mut bytes, source, model, faults);
     bytes.finish(source, faults, "the list of points", result);
 }
 
-fn read_points(bytes: &mut Bytes, source: &Source, model: &mut Model, faults: &mut Faults) -> Result<(), Stop> {
+fn read_points(
+    bytes: &mut Bytes,
+    source: &Source,
+    model: &mut Model,
+    faults: &mut Faults,
+) -> Result<(), Stop> {
     for _ in 0..bytes.count(8 + 24 + 3 + 8 + 8)? {
         bytes.begin_record();
         let id = bytes.u64()?;
@@ -221,7 +294,12 @@ fn read_points(bytes: &mut Bytes, source: &Source, model: &mut Model, faults: &m
             bytes.u32()?;
         }
         if position.is_finite() {
-            model.points.push(ModelPoint { position, color, error_px, image_ids });
+            model.points.push(ModelPoint {
+                position,
+                color,
+                error_px,
+                image_ids,
+            });
         } else {
             let message = format!("point {id} has a position that is not finite");
             faults.error(message, bytes.at(source), "re-export the model");

@@ -48,7 +48,9 @@ pub(crate) struct ModelPoint {
 /// The folder of the model inside the capture: `sparse/0` or `sparse`.
 pub(crate) fn locate(dir: &Path, faults: &mut Faults) -> Option<PathBuf> {
     let holds_model = |folder: &Path| {
-        ["cameras.bin", "cameras.txt", "images.bin", "images.txt"].iter().any(|name| folder.join(name).is_file())
+        ["cameras.bin", "cameras.txt", "images.bin", "images.txt"]
+            .iter()
+            .any(|name| folder.join(name).is_file())
     };
     for relative in ["sparse/0", "sparse"] {
         if holds_model(&dir.join(relative)) {
@@ -84,10 +86,17 @@ pub(crate) fn read(dir: &Path, relative: &Path, faults: &mut Faults) -> Model {
     // COLMAP prefers binary when both are there; the two files that matter decide for all.
     let has = |name: &str| dir.join(relative).join(name).is_file();
     let is_binary = has("cameras.bin") && has("images.bin");
-    let extension = if is_binary || !(has("cameras.txt") || has("images.txt")) { "bin" } else { "txt" };
+    let extension = if is_binary || !(has("cameras.txt") || has("images.txt")) {
+        "bin"
+    } else {
+        "txt"
+    };
     for part in ["cameras", "images", "points3D"] {
         let name = format!("{part}.{extension}");
-        let source = Source { path: dir.join(relative).join(&name), shown: relative.join(&name).display().to_string() };
+        let source = Source {
+            path: dir.join(relative).join(&name),
+            shown: relative.join(&name).display().to_string(),
+        };
         if !source.path.is_file() {
             if part == "points3D" {
                 faults.warning(
@@ -132,7 +141,10 @@ fn pose(values: &[f64; 7]) -> Result<DAffine3, &'static str> {
     if rotation.length_squared() < 1e-12 {
         return Err("has a rotation of length zero");
     }
-    Ok(DAffine3::from_rotation_translation(rotation.normalize(), DVec3::new(tx, ty, tz)))
+    Ok(DAffine3::from_rotation_translation(
+        rotation.normalize(),
+        DVec3::new(tx, ty, tz),
+    ))
 }
 
 /// Enters a camera, or its fault.
@@ -144,7 +156,10 @@ fn add_camera(
     camera: Result<SourceCamera, (String, &'static str)>,
 ) {
     let checked = camera.and_then(|camera| match camera.fault() {
-        Some(message) => Err((message, "re-export the model with sound intrinsics, for example as PINHOLE")),
+        Some(message) => Err((
+            message,
+            "re-export the model with sound intrinsics, for example as PINHOLE",
+        )),
         None => Ok(camera),
     });
     let entry = match checked {
@@ -155,12 +170,17 @@ fn add_camera(
         }
     };
     if model.cameras.insert(id, entry).is_some() {
-        faults.error(format!("camera {id} is there twice"), at, "re-export the model");
+        faults.error(
+            format!("camera {id} is there twice"),
+            at,
+            "re-export the model",
+        );
     }
 }
 
 /// Names of the models that can be imported, for hints.
-const UNSUPPORTED_HINT: &str = "undistort the photographs with COLMAP's image_undistorter, which writes PINHOLE cameras";
+const UNSUPPORTED_HINT: &str =
+    "undistort the photographs with COLMAP's image_undistorter, which writes PINHOLE cameras";
 
 #[cfg(test)]
 mod tests;

@@ -35,26 +35,41 @@ fn read_all(dir: &Path) -> (Model, Vec<Fault>) {
 fn project(model: &Model, image: &ModelImage, point: DVec3) -> DVec2 {
     let source = model.cameras[&image.camera_id].expect("a sound camera");
     let in_camera = image.camera_from_world.transform_point3(point);
-    source.project(DVec2::new(in_camera.x, in_camera.y) / in_camera.z).expect("a pixel")
+    source
+        .project(DVec2::new(in_camera.x, in_camera.y) / in_camera.z)
+        .expect("a pixel")
 }
 
 #[test]
 fn projections_agree_with_pycolmap_for_every_camera_model() {
     let mut models = 0;
     for entry in fs::read_dir(reference()).expect("reference data") {
-        let name = entry.expect("an entry").file_name().into_string().expect("a name");
+        let name = entry
+            .expect("an entry")
+            .file_name()
+            .into_string()
+            .expect("a name");
         for extension in ["bin", "txt"] {
             let dir = copied(&name, extension);
             let (model, faults) = read_all(dir.path());
             assert!(faults.is_empty(), "{name}.{extension}: {faults:?}");
-            assert_eq!((model.images.len(), model.points.len()), (3, 12), "{name}.{extension}");
-            let text = fs::read_to_string(reference().join(&name).join("projections.txt")).expect("projections");
+            assert_eq!(
+                (model.images.len(), model.points.len()),
+                (3, 12),
+                "{name}.{extension}"
+            );
+            let text = fs::read_to_string(reference().join(&name).join("projections.txt"))
+                .expect("projections");
             let mut largest = 0.0_f64;
             for line in text.lines() {
                 let mut words = line.split(' ');
                 let image_name = words.next().expect("a name").replace('_', " ");
                 let values: Vec<f64> = words.map(|word| word.parse().expect("a number")).collect();
-                let image = model.images.iter().find(|image| image.name == image_name).expect("the image");
+                let image = model
+                    .images
+                    .iter()
+                    .find(|image| image.name == image_name)
+                    .expect("the image");
                 let px = project(&model, image, DVec3::new(values[0], values[1], values[2]));
                 largest = largest.max(px.distance(DVec2::new(values[3], values[4])));
             }
@@ -76,7 +91,10 @@ fn binary_and_text_hold_the_same_model() {
         assert!(a.camera_from_world.abs_diff_eq(b.camera_from_world, 1e-12));
     }
     for (a, b) in binary.points.iter().zip(&text.points) {
-        assert_eq!((a.position, a.color, &a.image_ids), (b.position, b.color, &b.image_ids));
+        assert_eq!(
+            (a.position, a.color, &a.image_ids),
+            (b.position, b.color, &b.image_ids)
+        );
         assert_eq!(a.image_ids.len(), 3);
     }
 }
@@ -84,18 +102,33 @@ fn binary_and_text_hold_the_same_model() {
 #[test]
 fn every_truncation_of_a_binary_file_is_found() {
     for part in ["cameras", "images", "points3D"] {
-        let whole = fs::read(reference().join("pinhole").join(format!("{part}.bin"))).expect("the file");
+        let whole =
+            fs::read(reference().join("pinhole").join(format!("{part}.bin"))).expect("the file");
         for length in 0..whole.len() {
             // Every length is tried for the small file, a spread of them for the others.
             if whole.len() > 200 && length % 37 != 0 {
                 continue;
             }
             let dir = copied("pinhole", "bin");
-            fs::write(dir.path().join(format!("sparse/0/{part}.bin")), &whole[..length]).expect("written");
+            fs::write(
+                dir.path().join(format!("sparse/0/{part}.bin")),
+                &whole[..length],
+            )
+            .expect("written");
             let (_, faults) = read_all(dir.path());
             assert_eq!(faults.len(), 1, "{part} cut to {length}: {faults:?}");
-            assert!(faults[0].message.contains("truncated"), "{}", faults[0].message);
-            assert!(faults[0].at.starts_with(&format!("sparse/0/{part}.bin (byte ")), "{}", faults[0].at);
+            assert!(
+                faults[0].message.contains("truncated"),
+                "{}",
+                faults[0].message
+            );
+            assert!(
+                faults[0]
+                    .at
+                    .starts_with(&format!("sparse/0/{part}.bin (byte ")),
+                "{}",
+                faults[0].at
+            );
         }
     }
 }
@@ -131,13 +164,21 @@ fn faulty_cameras_are_named_with_their_line() {
         (3, "camera 8 has a focal length that is not a finite number"),
         (4, "camera 9 has the model FOV, which is not supported"),
         (5, "camera 10 has the unknown model CUBIC"),
-        (6, "camera 11 cannot be read: the line ends before a parameter"),
+        (
+            6,
+            "camera 11 cannot be read: the line ends before a parameter",
+        ),
         (7, "the camera's id is no number: \"x\""),
-        (8, "camera 12 cannot be read: more than the 4 parameters of PINHOLE"),
+        (
+            8,
+            "camera 12 cannot be read: more than the 4 parameters of PINHOLE",
+        ),
         (9, "camera 7 is there twice"),
     ];
-    let expected: Vec<(String, String)> =
-        expected.iter().map(|(line, text)| (format!("sparse/0/cameras.txt:{line}"), (*text).to_owned())).collect();
+    let expected: Vec<(String, String)> = expected
+        .iter()
+        .map(|(line, text)| (format!("sparse/0/cameras.txt:{line}"), (*text).to_owned()))
+        .collect();
     assert_eq!(found, expected);
 }
 
@@ -147,12 +188,22 @@ fn faulty_lines_of_images_and_points_are_named() {
     let images = "1 1 0 0 0 0 0 4 7 a.png\n\n2 0 0 0 0 0 0 4 7 b.png\n1 2 3\n3 1 0 0 0 inf 0 4 7 c.png\n\n\
                   4 1 0 0 q 0 0 4 7 d.png\n\n5 1 0 0 0 0 0 4 7\n\n";
     fs::write(dir.path().join("sparse/0/images.txt"), images).expect("written");
-    fs::write(dir.path().join("sparse/0/points3D.txt"), "1 0 0 nan 1 2 3 0.5 1 0\n2 0 0 0 1 2 300 0.5\n")
-        .expect("written");
+    fs::write(
+        dir.path().join("sparse/0/points3D.txt"),
+        "1 0 0 nan 1 2 3 0.5 1 0\n2 0 0 0 1 2 300 0.5\n",
+    )
+    .expect("written");
     let (model, faults) = read_all(dir.path());
     assert_eq!(model.images.len(), 1);
     let places: Vec<&str> = faults.iter().map(|fault| fault.at.as_str()).collect();
-    let expected = ["images.txt:3", "images.txt:5", "images.txt:7", "images.txt:9", "points3D.txt:1", "points3D.txt:2"];
+    let expected = [
+        "images.txt:3",
+        "images.txt:5",
+        "images.txt:7",
+        "images.txt:9",
+        "points3D.txt:1",
+        "points3D.txt:2",
+    ];
     assert_eq!(places, expected.map(|place| format!("sparse/0/{place}")));
 }
 
@@ -163,5 +214,8 @@ fn missing_parts_of_a_model_are_named() {
     fs::remove_file(dir.path().join("sparse/0/points3D.bin")).expect("removed");
     let (_, faults) = read_all(dir.path());
     assert_eq!(faults[0].at, "sparse/0/cameras.bin");
-    assert_eq!((faults[1].at.as_str(), faults[1].severity), ("sparse/0/points3D.bin", Severity::Warning));
+    assert_eq!(
+        (faults[1].at.as_str(), faults[1].severity),
+        ("sparse/0/points3D.bin", Severity::Warning)
+    );
 }

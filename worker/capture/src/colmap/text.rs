@@ -22,9 +22,17 @@ struct Lines {
 impl Lines {
     fn open(source: &Source, faults: &mut Faults) -> Option<Self> {
         match File::open(&source.path) {
-            Ok(file) => Some(Self { reader: BufReader::new(file), line: String::new(), number: 0 }),
+            Ok(file) => Some(Self {
+                reader: BufReader::new(file),
+                line: String::new(),
+                number: 0,
+            }),
             Err(error) => {
-                faults.error(format!("cannot read the file: {error}"), source.shown.as_str(), "check its permissions");
+                faults.error(
+                    format!("cannot read the file: {error}"),
+                    source.shown.as_str(),
+                    "check its permissions",
+                );
                 None
             }
         }
@@ -38,7 +46,11 @@ impl Lines {
             Ok(0) => false,
             Ok(_) => true,
             Err(error) => {
-                faults.error(format!("cannot read on: {error}"), self.at(source), "re-export the model as text");
+                faults.error(
+                    format!("cannot read on: {error}"),
+                    self.at(source),
+                    "re-export the model as text",
+                );
                 false
             }
         }
@@ -62,12 +74,18 @@ impl Lines {
 
 /// The next word as a number, or what is wrong with it.
 fn number<T: FromStr>(words: &mut SplitAsciiWhitespace<'_>, what: &str) -> Result<T, String> {
-    let word = words.next().ok_or_else(|| format!("the line ends before {what}"))?;
-    word.parse().ok().ok_or_else(|| format!("{what} is no number: {word:?}"))
+    let word = words
+        .next()
+        .ok_or_else(|| format!("the line ends before {what}"))?;
+    word.parse()
+        .ok()
+        .ok_or_else(|| format!("{what} is no number: {word:?}"))
 }
 
 pub(super) fn cameras(source: &Source, model: &mut Model, faults: &mut Faults) {
-    let Some(mut lines) = Lines::open(source, faults) else { return };
+    let Some(mut lines) = Lines::open(source, faults) else {
+        return;
+    };
     while lines.advance_to_data(source, faults) {
         let at = lines.at(source);
         let mut words = lines.line.split_ascii_whitespace();
@@ -84,8 +102,11 @@ pub(super) fn cameras(source: &Source, model: &mut Model, faults: &mut Faults) {
 
 fn camera(words: &mut SplitAsciiWhitespace<'_>) -> Result<SourceCamera, (String, &'static str)> {
     let garbled = |message: String| (format!("cannot be read: {message}"), LINE_HINT);
-    let name = words.next().ok_or_else(|| garbled("the line ends before the model's name".into()))?;
-    let kind = ModelKind::by_name(name).ok_or_else(|| (format!("has the unknown model {name}"), UNSUPPORTED_HINT))?;
+    let name = words
+        .next()
+        .ok_or_else(|| garbled("the line ends before the model's name".into()))?;
+    let kind = ModelKind::by_name(name)
+        .ok_or_else(|| (format!("has the unknown model {name}"), UNSUPPORTED_HINT))?;
     let width = number(words, "the width").map_err(garbled)?;
     let height = number(words, "the height").map_err(garbled)?;
     let mut params = Vec::with_capacity(kind.params);
@@ -93,15 +114,25 @@ fn camera(words: &mut SplitAsciiWhitespace<'_>) -> Result<SourceCamera, (String,
         params.push(number(words, "a parameter").map_err(garbled)?);
     }
     if words.next().is_some() {
-        return Err(garbled(format!("more than the {} parameters of {name}", kind.params)));
+        return Err(garbled(format!(
+            "more than the {} parameters of {name}",
+            kind.params
+        )));
     }
     kind.model
         .and_then(|model| SourceCamera::from_params(model, width, height, &params))
-        .ok_or_else(|| (format!("has the model {name}, which is not supported"), UNSUPPORTED_HINT))
+        .ok_or_else(|| {
+            (
+                format!("has the model {name}, which is not supported"),
+                UNSUPPORTED_HINT,
+            )
+        })
 }
 
 pub(super) fn images(source: &Source, model: &mut Model, faults: &mut Faults) {
-    let Some(mut lines) = Lines::open(source, faults) else { return };
+    let Some(mut lines) = Lines::open(source, faults) else {
+        return;
+    };
     while lines.advance_to_data(source, faults) {
         let at = lines.at(source);
         match image(&lines.line, &at) {
@@ -134,11 +165,19 @@ fn image(line: &str, at: &str) -> Result<ModelImage, String> {
         return Err(format!("image {id} has no name"));
     }
     let camera_from_world = pose(&values).map_err(|message| format!("image {name} {message}"))?;
-    Ok(ModelImage { id, name, camera_id, camera_from_world, at: at.to_owned() })
+    Ok(ModelImage {
+        id,
+        name,
+        camera_id,
+        camera_from_world,
+        at: at.to_owned(),
+    })
 }
 
 pub(super) fn points(source: &Source, model: &mut Model, faults: &mut Faults) {
-    let Some(mut lines) = Lines::open(source, faults) else { return };
+    let Some(mut lines) = Lines::open(source, faults) else {
+        return;
+    };
     while lines.advance_to_data(source, faults) {
         match point(&lines.line) {
             Ok(point) => model.points.push(point),
@@ -161,12 +200,21 @@ fn point(line: &str) -> Result<ModelPoint, String> {
     let error_px = number(&mut words, "the error")?;
     let mut image_ids = Vec::new();
     while let Some(word) = words.next() {
-        image_ids.push(word.parse().map_err(|_| format!("an image id of the track is no number: {word:?}"))?);
+        image_ids.push(
+            word.parse()
+                .ok()
+                .ok_or_else(|| format!("an image id of the track is no number: {word:?}"))?,
+        );
         number::<u32>(&mut words, "the point's index in the track")?;
     }
     let position = DVec3::from_array(position);
     if !position.is_finite() {
         return Err(format!("point {id} has a position that is not finite"));
     }
-    Ok(ModelPoint { position, color, error_px, image_ids })
+    Ok(ModelPoint {
+        position,
+        color,
+        error_px,
+        image_ids,
+    })
 }
