@@ -1,0 +1,316 @@
+//! From an imported scene to what training needs: the normalised proxy, views at working resolution, references.
+//!
+//! Colours. A photograph's pixel at the object's rim mixes object and background. Where the capture is black outside
+//! (a rendering or a cut-out with coverage), the colour is divided by the coverage in linear light, which gives the
+//! object's own colour, and the coverage stays as the pixel's weight. Where a photograph shows background, rim pixels
+//! cannot be repaired: they are left out by a weight that starts one pixel inside the mask or silhouette.
+
+use ign_capture::{Background, Frame, ImportError, Scene, ViewImage};
+use ign_geometry::{Camera, GBuffer, Mesh, Similarity, select};
+use ign_nets::color;
+use ign_render::{CoverageRule, ReferenceImage, RenderSettings, Target};
+use rayon::prelude::*;
+use tch::{Device, Kind, Tensor};
+
+use crate::BakeError;
+use crate::recipe::{Crop, Preset, Recipe, Settings};
+
+/// Of the training views, one in so many validates: it is neither trained on nor a reference.
+const VALIDATION_EVERY: usize = 10;
+/// At most so many validation views.
+const VALIDATION_MOST: usize = 8;
+/// Coverage below which a colour cannot be divided out of its background.
+const LEAST_COVERAGE: f32 = 0.1;
+/// Long side of the G-buffers on which references are chosen.
+const SELECTION_PX: u32 = 64;
+
+/// The scene in the normalised frame with its views split.
+pub(crate) struct Dataset<'a> {
+    pub(crate) scene: &'a Scene,
+    pub(crate) mesh: Mesh,
+    pub(crate) normalisation: Similarity,
+    pub(crate) frame: Frame,
+    pub(crate) settings: RenderSettings,
+    /// Factor between the references' resolution and the target's.
+    pub(crate) reference_scale: u32,
+    pub(crate) train: Vec<usize>,
+    pub(crate) validation: Vec<usize>,
+    pub(crate) held_out: Vec<usize>,
+    pub(crate) device: Device,
+}
+
+/// One view as it is scored.
+pub(crate) struct Scored {
+    pub(crate) target: Target,
+    /// [1, 3, H, W]: encoded sRGB, black outside the object.
+    pub(crate) truth: Tensor,
+    /// [1, 1, H, W]: 0 where both images are black before scoring, else 1.
+    pub(crate) scored: Tensor,
+    /// Row-major: on the object.
+    pub(crate) object: Vec<bool>,
+    /// [1, 1, H, W]: the same.
+    pub(crate) object_mask: Tensor,
+}
+
+/// A view's straight colours and weights at one camera.
+pub(crate) struct Straight {
+    pub(crate) camera: Camera,
+    /// Row-major RGB, encoded sRGB in [0, 1].
+    pub(crate) rgb: Vec<f32>,
+    /// Row-major weight in [0, 1].
+    pub(crate) alpha: Vec<f32>,
+}
+
+impl<'a> Dataset<'a> {
+    pub(crate) fn new(
+        scene: &'a Scene,
+        recipe: &Recipe,
+        settings: &Settings,
+        device: Device,
+    ) -> Result<Self, BakeError> {
+        let normalisation = scene.mesh.normalisation();
+        let frame = match recipe.crop {
+            Crop::Object => Frame::Object {
+                size: recipe.size,
+                margin: settings.margin,
+            },
+            Crop::None => Frame::Whole {
+                long_side: recipe.size,
+            },
+        };
+        let supersample = settings.supersample;
+        let reference_scale = scene.useful_scale(&frame, supersample);
+        let coverage = match scene.background {
+            Background::Black if reference_scale > 1 => CoverageRule::EncodedCells,
+            Background::Black => CoverageRule::EncodedPixel,
+            Background::MaskedOut | Background::Silhouette => CoverageRule::Fraction,
+        };
+        let every = VALIDATION_EVERY.max(scene.train.len().div_ceil(VALIDATION_MOST));
+        let mut train = Vec::new();
+        let mut validation = Vec::new();
+        for (at, &view) in scene.train.iter().enumerate() {
+            if scene.train.len() >= VALIDATION_EVERY && at % every == every / 2 {
+                validation.push(view);
+            } else {
+                train.push(view);
+            }
+        }
+        if train.len() < 2 {
+            return Err(BakeError::Unusable {
+                message: format!("only {} views are left to train on", train.len()),
+                hint: "a bake needs at least 2 training views; shorten the held-out list or add photographs".into(),
+            });
+        }
+        let render = RenderSettings {
+            k: settings.k,
+            supersample,
+            coverage,
+            recipe: match settings.preset {
+                Preset::Paper => ign_render::Recipe::Paper,
+                Preset::Standard => ign_render::Recipe::Standard,
+            },
+        };
+        Ok(Self {
+            scene,
+            mesh: scene.mesh.transformed(&normalisation),
+            normalisation,
+            frame,
+            settings: render,
+            reference_scale,
+            train,
+            validation,
+            held_out: scene.held_out.clone(),
+            device,
+        })
+    }
+
+    /// A view's camera in the normalised frame, and the world camera it comes from.
+    pub(crate) fn cameras(&self, view: usize, scale: u32) -> (Camera, Camera) {
+        let world = self.scene.frame_camera(view, &self.frame, scale);
+        (world.transformed(self.normalisation), world)
+    }
+
+    /// Loads a view as it is scored.
+    pub(crate) fn scored(&self, view: usize) -> Result<Scored, BakeError> {
+        let (camera, world) = self.cameras(view, 1);
+        let image = self.scene.load_view(view, &world)?;
+        let target = Target::new(&self.mesh, &camera, &self.settings, self.device);
+        let (h, w) = target.size();
+        let pixels = (h * w) as usize;
+        let silhouette = ign_nets::params::flat_values(&target.coverage);
+        let mut truth = image.rgb.clone();
+        let mut scored = vec![1.0f32; pixels];
+        let mut object = vec![false; pixels];
+        for pixel in 0..pixels {
+            let mask = image
+                .mask
+                .as_ref()
+                .map_or(silhouette[pixel], |mask| mask[pixel]);
+            if mask <= 0.0 || image.inside[pixel] < 0.5 {
+                scored[pixel] = 0.0;
+            }
+            let factor = match self.scene.background {
+                Background::Black => 1.0,
+                Background::MaskedOut | Background::Silhouette => mask,
+            };
+            for channel in 0..3 {
+                truth[pixel * 3 + channel] *= factor * scored[pixel];
+            }
+            object[pixel] = mask >= 0.5 && scored[pixel] > 0.0;
+        }
+        let truth = Tensor::from_slice(&truth)
+            .view([h, w, 3])
+            .permute([2, 0, 1])
+            .contiguous()
+            .unsqueeze(0);
+        Ok(Scored {
+            target,
+            truth: truth.to_device(self.device),
+            scored: Tensor::from_slice(&scored)
+                .view([1, 1, h, w])
+                .to_device(self.device),
+            object_mask: Tensor::from_slice(&object)
+                .view([1, 1, h, w])
+                .to_kind(Kind::Float)
+                .to_device(self.device),
+            object,
+        })
+    }
+
+    /// Loads a view's straight colours at `scale` times the working resolution.
+    pub(crate) fn straight(&self, view: usize, scale: u32) -> Result<Straight, ImportError> {
+        let (camera, world) = self.cameras(view, scale);
+        let image = self.scene.load_view(view, &world)?;
+        let (rgb, alpha) = match (self.scene.background, &image.mask) {
+            (Background::Black, Some(mask)) => unmultiplied(&image, mask),
+            (_, Some(mask)) => inside_only(&image, mask),
+            (_, None) => {
+                let silhouette = GBuffer::render(&self.mesh, &camera, 2).coverage;
+                inside_only(&image, &silhouette)
+            }
+        };
+        Ok(Straight { camera, rgb, alpha })
+    }
+
+    /// Chooses the fixed reference views by coverage (paper, Sec. "Coverage-based View Selection").
+    pub(crate) fn choose_references(&self, count: usize) -> Vec<usize> {
+        let views: Vec<GBuffer> = self
+            .train
+            .par_iter()
+            .map(|&view| {
+                let (camera, _) = self.cameras(view, 1);
+                let i = camera.intrinsics;
+                let scale = f64::from(SELECTION_PX) / f64::from(i.width.max(i.height));
+                let scaled = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
+                let small = Camera {
+                    intrinsics: i.resized(scaled(i.width), scaled(i.height)),
+                    camera_from_world: camera.camera_from_world,
+                };
+                GBuffer::render(&self.mesh, &small, 1)
+            })
+            .collect();
+        select::select_references(&views, count)
+            .into_iter()
+            .map(|at| self.train[at])
+            .collect()
+    }
+
+    /// Loads the reference views as the bundle stores them: 8 bit, straight colour and weight.
+    pub(crate) fn reference_images(
+        &self,
+        chosen: &[usize],
+    ) -> Result<Vec<ReferenceImage>, BakeError> {
+        chosen
+            .par_iter()
+            .map(|&view| {
+                let straight = self.straight(view, self.reference_scale)?;
+                let rgba = straight
+                    .alpha
+                    .iter()
+                    .zip(straight.rgb.chunks_exact(3))
+                    .flat_map(|(&alpha, rgb)| {
+                        let alpha = byte(alpha);
+                        let color = if alpha == 0 {
+                            [0, 0, 0]
+                        } else {
+                            [byte(rgb[0]), byte(rgb[1]), byte(rgb[2])]
+                        };
+                        [color[0], color[1], color[2], alpha]
+                    })
+                    .collect();
+                Ok(ReferenceImage {
+                    name: self.scene.views[view].name.clone(),
+                    camera: straight.camera,
+                    rgba,
+                })
+            })
+            .collect()
+    }
+}
+
+fn byte(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+fn linear(encoded: f32) -> f32 {
+    if encoded <= 0.040_45 {
+        encoded / 12.92
+    } else {
+        ((encoded + 0.055) / 1.055).powf(2.4)
+    }
+}
+
+fn encoded(linear: f32) -> f32 {
+    if linear <= 0.003_130_8 {
+        linear * 12.92
+    } else {
+        1.055 * linear.powf(1.0 / 2.4) - 0.055
+    }
+}
+
+/// Divides the coverage out of colours that were mixed with black in linear light.
+fn unmultiplied(image: &ViewImage, mask: &[f32]) -> (Vec<f32>, Vec<f32>) {
+    let mut rgb = image.rgb.clone();
+    let mut alpha = vec![0.0; mask.len()];
+    for (at, &coverage) in mask.iter().enumerate() {
+        let coverage = coverage.min(image.inside[at]);
+        if coverage >= LEAST_COVERAGE {
+            alpha[at] = coverage;
+            for value in &mut rgb[at * 3..at * 3 + 3] {
+                *value = encoded((linear(*value) / coverage).clamp(0.0, 1.0));
+            }
+        }
+    }
+    (rgb, alpha)
+}
+
+/// Keeps pixels whose neighbourhood lies inside the object and the photograph.
+fn inside_only(image: &ViewImage, mask: &[f32]) -> (Vec<f32>, Vec<f32>) {
+    let (w, h) = (image.width as usize, image.height as usize);
+    let mut alpha = vec![0.0f32; w * h];
+    for y in 0..h {
+        for x in 0..w {
+            let mut least = 1.0f32;
+            for ny in y.saturating_sub(1)..(y + 2).min(h) {
+                for nx in x.saturating_sub(1)..(x + 2).min(w) {
+                    least = least.min(mask[ny * w + nx]).min(image.inside[ny * w + nx]);
+                }
+            }
+            alpha[y * w + x] = if least >= 0.99 { 1.0 } else { 0.0 };
+        }
+    }
+    (image.rgb.clone(), alpha)
+}
+
+/// Mean squared errors on [0, 255] of `image` [1, 3, H, W] against a view's truth, both as 8-bit files would hold
+/// them: over the full frame and over the object.
+pub(crate) fn errors_255(image: &Tensor, view: &Scored) -> (f64, f64) {
+    let difference = color::quantised(&(image * &view.scored)) - color::quantised(&view.truth);
+    let squared = (difference * 255.0).square();
+    let object = view.object_mask.sum(Kind::Float).clamp_min(1.0) * 3.0;
+    let on_object = (&squared * &view.object_mask).sum(Kind::Float) / object;
+    (
+        squared.mean(Kind::Float).double_value(&[]),
+        on_object.double_value(&[]),
+    )
+}

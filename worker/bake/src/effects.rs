@@ -1,0 +1,431 @@
+//! Training of `EffectsNet` (Sec. "Self-supervised Training").
+//!
+//! Both forms minimise the difference of two views' diffuse colours at the same surface point. [`train_points`]
+//! states it as a prediction: what the other view saw, minus its effects, plus this view's effects, is what this view
+//! saw; compared in encoded sRGB, the values that are scored. Where the other view's colour is clipped, what it hides
+//! is unknown and the pair does not count.
+
+use ign_nets::effects::{PaperEffects, PointEffects};
+use ign_nets::optim::{Adam, cosine_rate};
+use ign_nets::warp::{Sources, directions};
+use ign_nets::{Builder, Params, color};
+use ign_render::{Effects, Target};
+use rand::RngExt;
+use rayon::prelude::*;
+use tch::{Device, Kind, Tensor};
+
+use crate::BakeError;
+use crate::checkpoint::{Schedule, Session, Trainee, load_weights};
+use crate::data::Dataset;
+use crate::sampler::{indices, step_rng};
+
+/// Weight of the l1 norm of the effects (paper: 0.01).
+const SPARSITY: f64 = 0.01;
+/// Weights average over about so many steps' worth: 1 / (1 - decay).
+const AVERAGE_DECAY: f64 = 0.995;
+/// Peak learning rate of the point effects (paper: 1e-3 constant for its U-Net).
+const POINT_RATE: f64 = 2e-3;
+/// Surface observations kept at most; more views thin them out evenly.
+const MOST_OBSERVATIONS: usize = 4_000_000;
+/// Encoded value above which a colour is clipped.
+const CLIPPED: f64 = 0.98;
+
+/// Name of the stage in checkpoints.
+pub(crate) const STAGE: &str = "effects";
+
+/// Every surface point that a training view sees, with its colour.
+struct Observations {
+    /// [N, 3].
+    points: Tensor,
+    /// [N, 3].
+    normals: Tensor,
+    /// [N, 3] encoded sRGB.
+    colors: Tensor,
+    /// [N] i64.
+    views: Tensor,
+    sources: Sources,
+    /// [V*H*W, 3] u8 and [V*H*W] u8.
+    source_colors: Tensor,
+    source_alpha: Tensor,
+}
+
+fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
+    struct One {
+        camera: ign_geometry::Camera,
+        points: Vec<f32>,
+        normals: Vec<f32>,
+        colors: Vec<f32>,
+        depth: Vec<f32>,
+        rgb: Vec<u8>,
+        alpha: Vec<u8>,
+    }
+    let per_view = MOST_OBSERVATIONS / data.train.len().max(1);
+    let views: Vec<One> = data
+        .train
+        .par_iter()
+        .map(|&view| {
+            let straight = data.straight(view, data.reference_scale)?;
+            let gbuffer = ign_geometry::GBuffer::render(&data.mesh, &straight.camera, 2);
+            let usable: Vec<usize> = (0..gbuffer.mask.len())
+                .filter(|&at| gbuffer.coverage[at] >= 1.0 && straight.alpha[at] >= 0.99)
+                .collect();
+            let stride = usable.len().div_ceil(per_view.max(1)).max(1);
+            let kept: Vec<usize> = usable.into_iter().step_by(stride).collect();
+            let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
+            Ok(One {
+                camera: straight.camera,
+                points: kept.iter().flat_map(|&at| gbuffer.position[at]).collect(),
+                normals: kept.iter().flat_map(|&at| gbuffer.normal[at]).collect(),
+                colors: kept
+                    .iter()
+                    .flat_map(|&at| {
+                        [
+                            straight.rgb[at * 3],
+                            straight.rgb[at * 3 + 1],
+                            straight.rgb[at * 3 + 2],
+                        ]
+                    })
+                    .collect(),
+                depth: gbuffer
+                    .depth
+                    .iter()
+                    .zip(&gbuffer.mask)
+                    .map(|(&d, &covered)| if covered { d } else { 0.0 })
+                    .collect(),
+                rgb: straight.rgb.iter().map(|&v| byte(v)).collect(),
+                alpha: straight.alpha.iter().map(|&v| byte(v)).collect(),
+            })
+        })
+        .collect::<Result<_, BakeError>>()?;
+    let width = views
+        .iter()
+        .map(|v| v.camera.intrinsics.width)
+        .max()
+        .unwrap_or(1);
+    let height = views
+        .iter()
+        .map(|v| v.camera.intrinsics.height)
+        .max()
+        .unwrap_or(1);
+    let cameras: Vec<_> = views
+        .iter()
+        .map(|v| {
+            let mut camera = v.camera;
+            (camera.intrinsics.width, camera.intrinsics.height) = (width, height);
+            camera
+        })
+        .collect();
+    let depth: Vec<Vec<f32>> = views
+        .iter()
+        .map(|v| padded(&v.depth, v.camera.intrinsics.width, 1, (width, height)))
+        .collect();
+    let depth: Vec<&[f32]> = depth.iter().map(Vec::as_slice).collect();
+    let stack = |pick: fn(&One) -> &Vec<f32>| {
+        Tensor::cat(
+            &views
+                .iter()
+                .map(|v| Tensor::from_slice(pick(v)).view([-1, 3]))
+                .collect::<Vec<_>>(),
+            0,
+        )
+        .to_device(data.device)
+    };
+    let index: Vec<Tensor> = views
+        .iter()
+        .enumerate()
+        .map(|(at, v)| {
+            Tensor::full(
+                [v.points.len() as i64 / 3],
+                at as i64,
+                (Kind::Int64, Device::Cpu),
+            )
+        })
+        .collect();
+    let rgb: Vec<Tensor> = views
+        .iter()
+        .map(|v| {
+            Tensor::from_slice(&padded(
+                &v.rgb,
+                v.camera.intrinsics.width,
+                3,
+                (width, height),
+            ))
+            .view([-1, 3])
+        })
+        .collect();
+    let alpha: Vec<Tensor> = views
+        .iter()
+        .map(|v| {
+            Tensor::from_slice(&padded(
+                &v.alpha,
+                v.camera.intrinsics.width,
+                1,
+                (width, height),
+            ))
+        })
+        .collect();
+    Ok(Observations {
+        points: stack(|v| &v.points),
+        normals: stack(|v| &v.normals),
+        colors: stack(|v| &v.colors),
+        views: Tensor::cat(&index, 0).to_device(data.device),
+        sources: Sources::new(&cameras, &depth, data.device),
+        source_colors: Tensor::cat(&rgb, 0).to_device(data.device),
+        source_alpha: Tensor::cat(&alpha, 0).to_device(data.device),
+    })
+}
+
+/// Copies a row-major image of `channels` into the top-left corner of one of size `to`.
+fn padded<T: Copy + Default>(from: &[T], width: u32, channels: usize, to: (u32, u32)) -> Vec<T> {
+    let (from_row, to_row) = (width as usize * channels, to.0 as usize * channels);
+    let mut out = vec![T::default(); to_row * to.1 as usize];
+    for (source, target) in from
+        .chunks_exact(from_row.max(1))
+        .zip(out.chunks_exact_mut(to_row.max(1)))
+    {
+        target[..from_row].copy_from_slice(source);
+    }
+    out
+}
+
+/// A network from finished weights.
+pub(crate) fn restore(
+    data: &Dataset<'_>,
+    session: &Session<'_>,
+    stage: &str,
+    paper: bool,
+) -> Result<Option<Effects>, BakeError> {
+    let Some(weights) = session.finished(stage) else {
+        return Ok(None);
+    };
+    let mut builder = Builder::new();
+    Ok(Some(if paper {
+        let net = PaperEffects::new(&mut builder);
+        let mut params = builder.build(data.device, 0);
+        load_weights(&mut params, weights)?;
+        Effects::Paper(net, params)
+    } else {
+        let net = PointEffects::new(&mut builder);
+        let mut params = builder.build(data.device, 0);
+        load_weights(&mut params, weights)?;
+        Effects::Points(net, params)
+    }))
+}
+
+/// Trains the point effects of preset `standard`.
+pub(crate) fn train_points(
+    data: &Dataset<'_>,
+    session: &mut Session<'_>,
+    schedule: Schedule,
+    (seed, batch): (u64, i64),
+) -> Result<(), BakeError> {
+    let observations = observe_all(data)?;
+    let mut builder = Builder::new();
+    let net = PointEffects::new(&mut builder);
+    let params = builder.build(data.device, seed);
+    let adam = Adam::new(&params, AVERAGE_DECAY);
+    let count = observations.points.size()[0];
+    let views = observations.sources.len() as i64;
+    let trainees = session.train(
+        STAGE,
+        vec![Trainee { params, adam }],
+        schedule,
+        |trainees, step, fraction, scale| {
+            let trainee = &mut trainees[0];
+            let mut rng = step_rng(seed, STAGE, step);
+            let pick = indices(&mut rng, batch, count, data.device);
+            let other = indices(&mut rng, batch, views, data.device);
+            let Some(loss) = point_loss(&observations, &net, &trainee.params, &pick, &other) else {
+                return 0.0;
+            };
+            let value = loss.double_value(&[]);
+            loss.backward();
+            trainee.adam.step(
+                &mut trainee.params,
+                cosine_rate(POINT_RATE, fraction) * scale,
+                1.0,
+            );
+            value
+        },
+        |_, _, _| Ok(None),
+    )?;
+    let averaged = trainees[0].adam.averaged(&trainees[0].params);
+    session.finish(STAGE, &averaged)
+}
+
+/// Mean prediction error over the pairs that see each other, plus the sparsity term; `None` when no pair does.
+fn point_loss(
+    all: &Observations,
+    net: &PointEffects,
+    params: &Params,
+    pick: &Tensor,
+    other: &Tensor,
+) -> Option<Tensor> {
+    let points = all.points.index_select(0, pick);
+    let normals = all.normals.index_select(0, pick);
+    let taps = all.sources.taps(&points, &normals, other);
+    let same = all.views.index_select(0, pick).eq_tensor(other);
+    let valid = taps
+        .visibility
+        .gt(0.9)
+        .logical_and(&taps.facing.gt(0.3))
+        .logical_and(&same.logical_not());
+    let rows = valid.nonzero().view([-1]);
+    if rows.size()[0] == 0 {
+        return None;
+    }
+    let cut = |t: &Tensor| t.index_select(0, &rows);
+    let (points, normals) = (cut(&points), cut(&normals));
+    let here_view = all.views.index_select(0, &pick.index_select(0, &rows));
+    let there_view = cut(other);
+    let color_here = all.colors.index_select(0, &pick.index_select(0, &rows));
+    let (index, weight) = (cut(&taps.index), cut(&taps.weight));
+    let n = rows.size()[0];
+    let flat = index.view([-1]);
+    let weight = weight
+        * all
+            .source_alpha
+            .index_select(0, &flat)
+            .view([n, 4])
+            .to_kind(Kind::Float)
+        / 255.0;
+    let total = weight.sum_dim_intlist([1i64].as_slice(), true, Kind::Float);
+    let picked = all
+        .source_colors
+        .index_select(0, &flat)
+        .view([n, 4, 3])
+        .to_kind(Kind::Float)
+        / 255.0;
+    let color_there =
+        (picked * weight.unsqueeze(2)).sum_dim_intlist([1i64].as_slice(), false, Kind::Float)
+            / total.clamp_min(1e-3);
+    let sound = total.gt(0.9).to_kind(Kind::Float);
+
+    let centers = all.sources.centers();
+    let here = net.forward(
+        params,
+        &points,
+        &normals,
+        &directions(&centers.index_select(0, &here_view), &points),
+    );
+    let there = net.forward(
+        params,
+        &points,
+        &normals,
+        &directions(&centers.index_select(0, &there_view), &points),
+    );
+    let (linear_here, linear_there) = (
+        color::linear_from_srgb(&color_here),
+        color::linear_from_srgb(&color_there),
+    );
+    let predicted_here = color::srgb_from_linear(&(&linear_there - &there + &here));
+    let predicted_there = color::srgb_from_linear(&(&linear_here - &here + &there));
+    let unclipped = |c: &Tensor| c.lt(CLIPPED).to_kind(Kind::Float);
+    let robust = |d: Tensor| (d.square() + 1e-4).sqrt();
+    let error = robust(predicted_here - &color_here) * unclipped(&color_there)
+        + robust(predicted_there - &color_there) * unclipped(&color_here);
+    let data_term =
+        (error * &sound).sum(Kind::Float) / (sound.sum(Kind::Float) * 6.0).clamp_min(1.0);
+    Some(data_term + (here + there).mean(Kind::Float) * (0.5 * SPARSITY))
+}
+
+/// Everything the paper's `EffectsNet` needs of one training view.
+struct PaperView {
+    /// [1, 9, H, W].
+    geometry: Tensor,
+    /// [H*W, 3] encoded sRGB.
+    colors: Tensor,
+    /// [H*W] 1 on the object.
+    mask: Tensor,
+    /// Pixels of `mask` that are 1.
+    pixels: Tensor,
+    camera: ign_geometry::Camera,
+    depth: Vec<f32>,
+}
+
+/// Trains the paper's `EffectsNet`: random image pairs, l2 of the masked difference, 0.01 l1 of the effects, Adam 1e-3.
+///
+/// The paper gives norms without saying how they scale with the number of pixels; here both are means per pixel, so
+/// that their ratio does not depend on the resolution.
+pub(crate) fn train_paper(
+    data: &Dataset<'_>,
+    session: &mut Session<'_>,
+    stage: &'static str,
+    schedule: Schedule,
+    seed: u64,
+) -> Result<(), BakeError> {
+    let views: Vec<PaperView> = data
+        .train
+        .iter()
+        .map(|&view| {
+            let straight = data.straight(view, 1)?;
+            let target = Target::new(&data.mesh, &straight.camera, &data.settings, data.device);
+            let gbuffer = ign_geometry::GBuffer::render(&data.mesh, &straight.camera, 1);
+            let covered = Tensor::from_slice(&gbuffer.mask).to_kind(Kind::Float);
+            let mask = (covered
+                * Tensor::from_slice(&straight.alpha)
+                    .gt(0.5)
+                    .to_kind(Kind::Float))
+            .to_device(data.device);
+            Ok(PaperView {
+                geometry: target.geometry,
+                colors: Tensor::from_slice(&straight.rgb)
+                    .view([-1, 3])
+                    .to_device(data.device),
+                pixels: mask.nonzero().view([-1]),
+                mask,
+                camera: straight.camera,
+                depth: gbuffer
+                    .depth
+                    .iter()
+                    .zip(&gbuffer.mask)
+                    .map(|(&d, &c)| if c { d } else { 0.0 })
+                    .collect(),
+            })
+        })
+        .collect::<Result<_, BakeError>>()?;
+    let mut builder = Builder::new();
+    let net = PaperEffects::new(&mut builder);
+    let params = builder.build(data.device, seed);
+    let adam = Adam::new(&params, 0.0);
+    let trainees = session.train(
+        stage,
+        vec![Trainee { params, adam }],
+        schedule,
+        |trainees, step, _, scale| {
+            let trainee = &mut trainees[0];
+            let mut rng = step_rng(seed, stage, step);
+            let p = &views[rng.random_range(0..views.len())];
+            let q = &views[rng.random_range(0..views.len())];
+            let effects = net.forward(
+                &trainee.params,
+                &Tensor::cat(&[&p.geometry, &q.geometry], 0),
+                true,
+            );
+            let flat = |at: i64| effects.select(0, at).view([3, -1]).tr();
+            let diffuse_p = &p.colors - flat(0);
+            let diffuse_q = &q.colors - flat(1);
+            let rows = |t: Tensor| t.view([-1, t.size()[1]]).index_select(0, &p.pixels);
+            let map = p.geometry.view([9, -1]).tr();
+            let sources = Sources::new(&[q.camera], &[q.depth.as_slice()], data.device);
+            let points = rows(map.narrow(1, 0, 3).contiguous());
+            let normals = rows(map.narrow(1, 3, 3).contiguous());
+            let zeros = Tensor::zeros([points.size()[0]], (Kind::Int64, data.device));
+            let taps = sources.taps(&points, &normals, &zeros).weighted(&q.mask);
+            let visible = taps.visibility.gt(0.5).to_kind(Kind::Float).unsqueeze(1);
+            let warped = taps.gather(&diffuse_q) / taps.visibility.clamp_min(1e-3).unsqueeze(1);
+            let difference = (rows(diffuse_p) - warped) * &visible;
+            let count = (visible.sum(Kind::Float) * 3.0).clamp_min(1.0);
+            let loss = (difference.square().sum(Kind::Float) / count + 1e-8).sqrt()
+                + effects.abs().mean(Kind::Float) * SPARSITY;
+            let value = loss.double_value(&[]);
+            loss.backward();
+            trainee
+                .adam
+                .step(&mut trainee.params, 1e-3 * scale, f64::INFINITY);
+            value
+        },
+        |_, _, _| Ok(None),
+    )?;
+    session.finish(stage, &trainees[0].params)
+}

@@ -1,0 +1,317 @@
+//! Writes the bundle: references, proxy, networks, metrics, held-out images, report, previews.
+
+use std::io::Cursor;
+use std::path::PathBuf;
+
+use chrono::{DateTime, SecondsFormat, Utc};
+use ign_bundle::manifest::{
+    MetricsSummary, Networks, ObjectName, Provenance, SCHEMA, StageSeconds,
+};
+use ign_bundle::metrics::Metrics;
+use ign_bundle::report::{ReportInput, ReportView, render_report};
+use ign_bundle::{BundleWriter, COMPOSITION_FILE, EFFECTS_FILE, Manifest, Precision, Reference};
+use ign_nets::color;
+use ign_render::{Effects, Model, NetworkFiles, ReferenceImage, Target, orbit, to_image};
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::webp::WebPEncoder;
+use image::{ExtendedColorType, ImageEncoder, RgbImage};
+
+use crate::BakeError;
+use crate::data::{Dataset, Scored};
+use crate::evaluate::Row;
+use crate::progress::Reporter;
+use crate::recipe::Settings;
+use crate::run::BakeJob;
+
+/// Frames of the turntable preview, laid out side by side in one picture.
+const PREVIEW_FRAMES: usize = 24;
+/// Frames per row of the preview.
+const PREVIEW_COLUMNS: u32 = 6;
+/// Pixels of one preview frame.
+const PREVIEW_PX: u32 = 192;
+/// Held-out views that the report shows.
+const REPORT_VIEWS: usize = 4;
+
+/// Everything a finished bake knows.
+pub(crate) struct Finished<'a> {
+    pub(crate) job: &'a BakeJob,
+    pub(crate) settings: &'a Settings,
+    pub(crate) data: &'a Dataset<'a>,
+    pub(crate) model: &'a Model,
+    pub(crate) images: &'a [ReferenceImage],
+    pub(crate) views: &'a [(String, &'a Scored)],
+    pub(crate) rows: Vec<Row>,
+    pub(crate) metrics: Metrics,
+    pub(crate) started_at: DateTime<Utc>,
+    pub(crate) reporter: &'a Reporter<'a>,
+}
+
+/// Writes and verifies the bundle; returns its folder.
+pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
+    let Finished {
+        job,
+        settings,
+        data,
+        model,
+        images,
+        views,
+        rows,
+        mut metrics,
+        started_at,
+        reporter,
+    } = finished;
+    reporter.stage("pack", "writing the bundle");
+    let dir = job.work_dir.join("bundle");
+    if dir.exists() {
+        // What an earlier attempt left here is incomplete: a complete one would have been published.
+        std::fs::remove_dir_all(&dir).map_err(|source| BakeError::Io {
+            path: dir.clone(),
+            source,
+        })?;
+    }
+    let writer = BundleWriter::create(&dir)?;
+    let references: Vec<Reference> = images
+        .iter()
+        .map(|image| Reference {
+            name: image.name.clone(),
+            camera: image.camera,
+            width: image.camera.intrinsics.width,
+            height: image.camera.intrinsics.height,
+            rgba: image.rgba.clone(),
+            exposure_gain: [1.0; 3],
+            crop: None,
+        })
+        .collect();
+    writer.references(&references)?;
+    writer.proxy(&data.mesh, &data.normalisation)?;
+
+    let dtype = if settings.half_weights {
+        Precision::Fp16
+    } else {
+        Precision::Fp32
+    };
+    let effects = model
+        .effects()
+        .map(|effects| NetworkFiles::of_effects(effects, dtype));
+    if let Some(files) = &effects {
+        writer.weights(EFFECTS_FILE, &files.tensors, dtype)?;
+    }
+    let composition = model
+        .composition
+        .as_ref()
+        .map(|net| NetworkFiles::of_composition(net, data.settings.k, dtype));
+    if let Some(files) = &composition {
+        writer.weights(COMPOSITION_FILE, &files.tensors, dtype)?;
+    }
+
+    let ours = rows.iter().find(|row| row.metrics.name == "ours");
+    if let Some(ours) = ours {
+        for ((name, scored), image) in views.iter().zip(&ours.images) {
+            writer.held_out(name, "ours", image)?;
+            writer.held_out(name, "target", &to_image(&scored.truth))?;
+        }
+    }
+    let preview = preview(data, model);
+    writer.file("preview.webp", &webp(&preview)?)?;
+    writer.file(
+        "thumbnail.jpg",
+        &jpeg(&image::imageops::crop_imm(&preview, 0, 0, PREVIEW_PX, PREVIEW_PX).to_image())?,
+    )?;
+
+    let report_views = report_views(views, &rows, model);
+    metrics.methods = rows.into_iter().map(|row| row.metrics).collect();
+    metrics.stages = reporter
+        .stages()
+        .into_iter()
+        .map(|(name, secs)| StageSeconds { name, secs })
+        .collect();
+    let bytes: u64 = written_bytes(&dir, &["held_out", "preview.webp", "thumbnail.jpg"])?;
+    for method in &mut metrics.methods {
+        method.bundle_bytes = bytes;
+    }
+    writer.metrics(&metrics)?;
+
+    let manifest = Manifest {
+        schema: SCHEMA.into(),
+        object: ObjectName {
+            collection: job.object.0.clone(),
+            object: job.object.1.clone(),
+        },
+        networks: Networks {
+            effects: effects.map(|files| files.description),
+            composition: composition.map(|files| files.description),
+        },
+        capture: job.capture_digest.clone(),
+        recipe: serde_json::to_value(&job.recipe).unwrap_or_default(),
+        plan: metrics.plan.clone(),
+        provenance: Provenance {
+            software: concat!("ign ", env!("CARGO_PKG_VERSION")).into(),
+            git: option_env!("IGN_GIT_COMMIT").map(str::to_owned),
+            device: metrics.device.clone(),
+            seeds: vec![job.recipe.seed],
+            started_at: started_at.to_rfc3339_opts(SecondsFormat::Secs, true),
+            finished_at: Utc::now().to_rfc3339_opts(SecondsFormat::Secs, true),
+            stages: metrics.stages.clone(),
+        },
+        files: Vec::new(),
+        metrics: MetricsSummary::from(&metrics),
+        normalised_from_world: data.normalisation.into(),
+        colour_space: "srgb".into(),
+        render: serde_json::to_value(&data.settings).unwrap_or_default(),
+    };
+    let words: Vec<String> = manifest.plan["words"]
+        .as_array()
+        .map(|words| {
+            words
+                .iter()
+                .filter_map(|word| word.as_str().map(str::to_owned))
+                .collect()
+        })
+        .unwrap_or_default();
+    let title = data
+        .scene
+        .info
+        .title
+        .clone()
+        .unwrap_or_else(|| format!("{}/{}", job.object.0, job.object.1));
+    writer.report(&render_report(&ReportInput {
+        title: &title,
+        manifest: &manifest,
+        metrics: &metrics,
+        views: &report_views,
+        plan: &words,
+    }))?;
+    writer.finish(manifest)?;
+    Ok(dir)
+}
+
+/// The worst views first, then an even spread over the rest.
+fn report_views(views: &[(String, &Scored)], rows: &[Row], model: &Model) -> Vec<ReportView> {
+    let find = |name: &str| rows.iter().find(|row| row.metrics.name == name);
+    let Some(ours) = find("ours") else {
+        return Vec::new();
+    };
+    let baseline = [find("n_ibr"), find("ibr")]
+        .into_iter()
+        .flatten()
+        .min_by(|a, b| a.metrics.mse.total_cmp(&b.metrics.mse));
+    let Some(baseline) = baseline else {
+        return Vec::new();
+    };
+    let mut order: Vec<usize> = (0..views.len()).collect();
+    order.sort_by(|&a, &b| {
+        ours.metrics.per_view[b]
+            .mse
+            .total_cmp(&ours.metrics.per_view[a].mse)
+    });
+    let step = (order.len() / REPORT_VIEWS).max(1);
+    order
+        .into_iter()
+        .step_by(step)
+        .take(REPORT_VIEWS)
+        .map(|at| {
+            let (name, scored) = &views[at];
+            let (diffuse, effects) = match model.effects() {
+                None => (None, None),
+                Some(effects) => {
+                    let raw = model.target_effects(&scored.target);
+                    let shown = match effects {
+                        Effects::Points(..) => color::srgb_from_linear(&raw),
+                        Effects::Paper(..) => raw,
+                    };
+                    (
+                        Some(to_image(&model.diffuse_image(&scored.target))),
+                        Some(to_image(&(shown * &scored.target.coverage))),
+                    )
+                }
+            };
+            ReportView {
+                name: name.clone(),
+                target: to_image(&scored.truth),
+                ours: ours.images[at].clone(),
+                baseline: baseline.images[at].clone(),
+                baseline_name: baseline.metrics.name.clone(),
+                diffuse,
+                effects,
+            }
+        })
+        .collect()
+}
+
+/// A turntable as one picture of frames, row by row.
+fn preview(data: &Dataset<'_>, model: &Model) -> RgbImage {
+    let rows = (PREVIEW_FRAMES as u32).div_ceil(PREVIEW_COLUMNS);
+    let mut sheet = RgbImage::new(PREVIEW_COLUMNS * PREVIEW_PX, rows * PREVIEW_PX);
+    for (index, camera) in orbit(&model.references.cameras, PREVIEW_FRAMES, PREVIEW_PX)
+        .iter()
+        .enumerate()
+    {
+        let target = Target::new(&data.mesh, camera, &data.settings, data.device);
+        let frame = to_image(&model.image(&target));
+        let (x, y) = (
+            index as u32 % PREVIEW_COLUMNS,
+            index as u32 / PREVIEW_COLUMNS,
+        );
+        image::imageops::replace(
+            &mut sheet,
+            &frame,
+            i64::from(x * PREVIEW_PX),
+            i64::from(y * PREVIEW_PX),
+        );
+    }
+    sheet
+}
+
+fn webp(image: &RgbImage) -> Result<Vec<u8>, BakeError> {
+    let mut bytes = Vec::new();
+    WebPEncoder::new_lossless(Cursor::new(&mut bytes))
+        .write_image(
+            image,
+            image.width(),
+            image.height(),
+            ExtendedColorType::Rgb8,
+        )
+        .map_err(|source| BakeError::Picture {
+            file: "preview.webp",
+            source,
+        })?;
+    Ok(bytes)
+}
+
+fn jpeg(image: &RgbImage) -> Result<Vec<u8>, BakeError> {
+    let mut bytes = Vec::new();
+    JpegEncoder::new_with_quality(Cursor::new(&mut bytes), 88)
+        .write_image(
+            image,
+            image.width(),
+            image.height(),
+            ExtendedColorType::Rgb8,
+        )
+        .map_err(|source| BakeError::Picture {
+            file: "thumbnail.jpg",
+            source,
+        })?;
+    Ok(bytes)
+}
+
+/// Bytes of the files that a viewer needs: all but those under the given names.
+fn written_bytes(dir: &std::path::Path, without: &[&str]) -> Result<u64, BakeError> {
+    let io = |source| BakeError::Io {
+        path: dir.to_owned(),
+        source,
+    };
+    let mut total = 0;
+    for entry in std::fs::read_dir(dir).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        if without.iter().any(|name| entry.file_name() == *name) {
+            continue;
+        }
+        let metadata = entry.metadata().map_err(io)?;
+        total += if metadata.is_dir() {
+            written_bytes(&entry.path(), &[])?
+        } else {
+            metadata.len()
+        };
+    }
+    Ok(total)
+}

@@ -1,0 +1,144 @@
+//! Progress of a whole bake: one percentage, one estimate of the time left.
+
+use ign_events::{Event, Level, Progress};
+use std::cell::RefCell;
+use std::time::{Duration, Instant};
+
+/// Stages with their share of a bake's expected time.
+const STAGES: [(&str, f64); 6] = [
+    ("import", 4.0),
+    ("plan", 6.0),
+    ("effects", 25.0),
+    ("composition", 55.0),
+    ("evaluate", 8.0),
+    ("pack", 2.0),
+];
+/// Progress events at most this often.
+const INTERVAL: Duration = Duration::from_millis(500);
+
+/// Emits events for one bake.
+pub(crate) struct Reporter<'a> {
+    sink: &'a dyn Fn(Event),
+    state: RefCell<State>,
+}
+
+struct State {
+    started: Instant,
+    /// Percent at the start: a resumed bake does not begin at 0, and its estimate must not either.
+    first_percent: Option<f64>,
+    last_sent: Option<Instant>,
+    stage: &'static str,
+    stage_started: Instant,
+    stages: Vec<(String, f64)>,
+    error: Option<f64>,
+}
+
+impl<'a> Reporter<'a> {
+    pub(crate) fn new(sink: &'a dyn Fn(Event)) -> Self {
+        let now = Instant::now();
+        Self {
+            sink,
+            state: RefCell::new(State {
+                started: now,
+                first_percent: None,
+                last_sent: None,
+                stage: "",
+                stage_started: now,
+                stages: Vec::new(),
+                error: None,
+            }),
+        }
+    }
+
+    /// Begins a stage; the time of the former one is kept.
+    pub(crate) fn stage(&self, stage: &'static str, message: &str) {
+        {
+            let mut state = self.state.borrow_mut();
+            close_stage(&mut state);
+            state.stage = stage;
+            state.last_sent = None;
+        }
+        self.step(0.0, message);
+    }
+
+    /// Reports progress within the stage, from 0 to 1.
+    pub(crate) fn step(&self, fraction: f64, message: &str) {
+        let mut state = self.state.borrow_mut();
+        let now = Instant::now();
+        if state.last_sent.is_some_and(|last| now - last < INTERVAL) {
+            return;
+        }
+        state.last_sent = Some(now);
+        let before: f64 = STAGES
+            .iter()
+            .take_while(|(name, _)| *name != state.stage)
+            .map(|(_, share)| share)
+            .sum();
+        let share = STAGES
+            .iter()
+            .find(|(name, _)| *name == state.stage)
+            .map_or(0.0, |(_, share)| *share);
+        let percent = before + share * fraction.clamp(0.0, 1.0);
+        let first = *state.first_percent.get_or_insert(percent);
+        let done = percent - first;
+        let eta_secs =
+            (done > 3.0).then(|| state.started.elapsed().as_secs_f64() * (100.0 - percent) / done);
+        let event = Event::Progress(Progress {
+            stage: state.stage.to_owned(),
+            percent,
+            eta_secs,
+            error: state.error,
+            message: message.to_owned(),
+        });
+        drop(state);
+        (self.sink)(event);
+    }
+
+    /// Keeps the newest validation error for the progress line.
+    pub(crate) fn error(&self, mse: f64) {
+        self.state.borrow_mut().error = Some(mse);
+    }
+
+    pub(crate) fn info(&self, message: impl Into<String>) {
+        tracing::info!("{}", self.log(Level::Info, message.into()));
+    }
+
+    pub(crate) fn warn(&self, message: impl Into<String>) {
+        tracing::warn!("{}", self.log(Level::Warn, message.into()));
+    }
+
+    fn log(&self, level: Level, message: String) -> String {
+        (self.sink)(Event::Log {
+            level,
+            message: message.clone(),
+        });
+        message
+    }
+
+    pub(crate) fn emit(&self, event: Event) {
+        (self.sink)(event);
+    }
+
+    /// Seconds per stage so far, in order.
+    pub(crate) fn stages(&self) -> Vec<(String, f64)> {
+        let mut state = self.state.borrow_mut();
+        close_stage(&mut state);
+        state.stages.clone()
+    }
+}
+
+fn close_stage(state: &mut State) {
+    let secs = state.stage_started.elapsed().as_secs_f64();
+    state.stage_started = Instant::now();
+    if state.stage.is_empty() {
+        return;
+    }
+    match state
+        .stages
+        .iter_mut()
+        .find(|(name, _)| name == state.stage)
+    {
+        Some((_, total)) => *total += secs,
+        None => state.stages.push((state.stage.to_owned(), secs)),
+    }
+}

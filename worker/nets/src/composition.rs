@@ -1,0 +1,206 @@
+//! `CompositionNet`: from K warped views to one image (Sec. "CompositionNet").
+//!
+//! - [`PaperComposition`]: the paper's U-Net that paints RGB through a sigmoid.
+//! - [`BlendComposition`] (preset `standard`): predicts per-pixel softmax weights over the K warped views and one
+//!   generated layer.
+//!
+//! Deviation: the blending head. Its last layer starts at zero, so training starts at the image-based rendering
+//! whose weights it is given, and the network learns only what those get wrong; no normalisation layer, so a crop
+//! and the full frame agree. The measured effect is in worker/nets/README.md.
+
+use crate::params::{Builder, Init, Params};
+use crate::unet::{Conv, UNet};
+use tch::{Kind, Tensor};
+
+const PAPER_WIDTHS: [i64; 6] = [64, 64, 128, 128, 256, 256];
+
+/// The paper's `CompositionNet`: input 3K warped colours, 2K warp fields, 3 target positions.
+#[derive(Debug)]
+pub struct PaperComposition {
+    net: UNet,
+}
+
+impl PaperComposition {
+    /// Channels of the input for `k` warped views; 23 for K = 4.
+    pub fn input_channels(k: usize) -> i64 {
+        5 * k as i64 + 3
+    }
+
+    /// Registers the network's tensors.
+    pub fn new(builder: &mut Builder, k: usize) -> Self {
+        let input = Self::input_channels(k);
+        Self {
+            net: builder.scope("composition", |b| {
+                UNet::new(b, input, &PAPER_WIDTHS, 3, 0.2)
+            }),
+        }
+    }
+
+    /// input: [B, 5K + 3, H, W] -> [B, 3, H, W], encoded sRGB in [0, 1].
+    pub fn forward(&self, params: &Params, input: &Tensor, train: bool) -> Tensor {
+        self.net.forward(params, input, train).sigmoid()
+    }
+}
+
+/// What the blending head works on; all [B, ., H, W], the candidates in encoded sRGB.
+#[derive(Debug)]
+pub struct BlendInput {
+    /// [B, K, 3, H, W]: warped views with the target's effects, 0 where not visible.
+    pub candidates: Tensor,
+    /// [B, K, H, W]: weights of plain image-based rendering; they sum to 1 where any view sees the point, else 0.
+    pub prior: Tensor,
+    /// [B, K, H, W] in [0, 1]: how much of the pixel each view sees.
+    pub visibility: Tensor,
+    /// [B, C, H, W]: what is known of the target: position, normal, effects, coverage.
+    pub target: Tensor,
+}
+
+impl BlendInput {
+    /// A window of every tensor.
+    #[must_use]
+    pub fn crop(&self, y: i64, x: i64, height: i64, width: i64) -> Self {
+        let cut = |t: &Tensor| {
+            let n = t.dim() as i64;
+            t.narrow(n - 2, y, height).narrow(n - 1, x, width)
+        };
+        Self {
+            candidates: cut(&self.candidates),
+            prior: cut(&self.prior),
+            visibility: cut(&self.visibility),
+            target: cut(&self.target),
+        }
+    }
+
+    /// Stacks inputs of one size along the batch.
+    pub fn batch(inputs: &[Self]) -> Self {
+        let cat = |pick: fn(&Self) -> &Tensor| {
+            Tensor::cat(&inputs.iter().map(pick).collect::<Vec<_>>(), 0)
+        };
+        Self {
+            candidates: cat(|i| &i.candidates),
+            prior: cat(|i| &i.prior),
+            visibility: cat(|i| &i.visibility),
+            target: cat(|i| &i.target),
+        }
+    }
+
+    /// [B, 3, H, W]: plain image-based rendering with the prior's weights.
+    pub fn prior_blend(&self) -> Tensor {
+        (&self.candidates * self.prior.unsqueeze(2)).sum_dim_intlist(
+            [1i64].as_slice(),
+            false,
+            Kind::Float,
+        )
+    }
+}
+
+/// Channels of [`BlendInput::target`]: position 3, normal 3, effects 3, coverage 1.
+pub const TARGET_CHANNELS: i64 = 10;
+/// Logit with which the generated layer starts: 2 % where some view sees the pixel, all where none does.
+const GENERATED_LOGIT: f64 = -4.0;
+
+/// `CompositionNet` of preset `standard`.
+#[derive(Debug)]
+pub struct BlendComposition {
+    k: i64,
+    stem: Conv,
+    down: Vec<(Conv, Conv)>,
+    up: Vec<(Conv, Conv)>,
+    head: Conv,
+}
+
+/// Channels per resolution level of [`BlendComposition`], full resolution first.
+pub const BLEND_WIDTHS: [i64; 4] = [32, 48, 64, 96];
+
+impl BlendComposition {
+    /// Registers the network's tensors for `k` candidates.
+    pub fn new(builder: &mut Builder, k: usize) -> Self {
+        let k = k as i64;
+        let w = BLEND_WIDTHS;
+        builder.scope("composition", |b| {
+            let stem = Conv::new(b, "stem", (5 * k + 3 + TARGET_CHANNELS, w[0]), (3, 1, 1));
+            let down = (1..w.len())
+                .map(|i| {
+                    let first = Conv::new(b, &format!("down{i}a"), (w[i - 1], w[i]), (4, 2, 1));
+                    (
+                        first,
+                        Conv::new(b, &format!("down{i}b"), (w[i], w[i]), (3, 1, 1)),
+                    )
+                })
+                .collect();
+            let up = (1..w.len())
+                .rev()
+                .map(|i| {
+                    let first = Conv::new(b, &format!("up{i}a"), (w[i], w[i - 1]), (3, 1, 1));
+                    (
+                        first,
+                        Conv::new(b, &format!("up{i}b"), (2 * w[i - 1], w[i - 1]), (3, 1, 1)),
+                    )
+                })
+                .collect();
+            let head = Conv::with_init(b, "head", (w[0], k + 4), (3, 1, 1), Init::Constant(0.0));
+            Self {
+                k,
+                stem,
+                down,
+                up,
+                head,
+            }
+        })
+    }
+
+    /// -> [B, 3, H, W], encoded sRGB, in [0, 1] up to the generated layer's small overshoot.
+    pub fn forward(&self, params: &Params, input: &BlendInput) -> Tensor {
+        let base = input.prior_blend();
+        let size = input.candidates.size();
+        let (batch, height, width) = (size[0], size[3], size[4]);
+        // Candidates are shown as differences from the plain blend: that is what the weights act on.
+        let differences = (&input.candidates - base.unsqueeze(1))
+            * input.visibility.gt(0.0).to_kind(Kind::Float).unsqueeze(2);
+        let x = Tensor::cat(
+            &[
+                differences.reshape([batch, self.k * 3, height, width]) * 4.0,
+                base.shallow_clone(),
+                input.prior.shallow_clone(),
+                input.visibility.shallow_clone(),
+                input.target.shallow_clone(),
+            ],
+            1,
+        );
+        let step = 1i64 << self.down.len();
+        let pad = |n: i64| (step - n % step) % step;
+        let x = x.constant_pad_nd([0, pad(width), 0, pad(height)]);
+        let mut x = activate(&self.stem.forward(params, &x));
+        let mut skips = Vec::new();
+        for (first, second) in &self.down {
+            skips.push(x.shallow_clone());
+            x = activate(&first.forward(params, &x));
+            x = &x + activate(&second.forward(params, &x));
+        }
+        for (first, second) in &self.up {
+            let skip = skips.pop().expect("one skip per level");
+            let (_, _, h, w) = skip.size4().expect("[B, C, H, W]");
+            let grown = first
+                .forward(params, &x)
+                .upsample_nearest2d([h, w], None, None);
+            x = activate(&second.forward(params, &Tensor::cat(&[activate(&grown), skip], 1)));
+        }
+        let out = self
+            .head
+            .forward(params, &x)
+            .narrow(2, 0, height)
+            .narrow(3, 0, width);
+        let seen = input.visibility.gt(0.0).to_kind(Kind::Float);
+        let logits = (&input.prior + 1e-4).log() + out.narrow(1, 0, self.k) + (seen - 1.0) * 1e4;
+        let generated_logit = out.narrow(1, self.k, 1) + GENERATED_LOGIT;
+        let weights = Tensor::cat(&[logits, generated_logit], 1).softmax(1, Kind::Float);
+        let generated = &base + out.narrow(1, self.k + 1, 3);
+        let blended = (&input.candidates * weights.narrow(1, 0, self.k).unsqueeze(2))
+            .sum_dim_intlist([1i64].as_slice(), false, Kind::Float);
+        blended + generated * weights.narrow(1, self.k, 1)
+    }
+}
+
+fn activate(x: &Tensor) -> Tensor {
+    x.maximum(&(x * 0.1))
+}
