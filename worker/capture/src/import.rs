@@ -820,6 +820,3 @@ fn points(model: &Model, views: &[SeeingView]) -> Vec<Point> {
     };
     model.points.iter().map(point).collect()
 }
-
-#[cfg(test)]
-mod tests;

@@ -1,1 +1,0 @@
-//! Faults of a capture folder, one by one.

@@ -1,0 +1,5 @@
+//! Captures on disk through the public interface: preflight and loading of views.
+
+mod common;
+mod loading;
+mod preflight;
