@@ -139,6 +139,13 @@ impl Faults {
         self.list.extend(faults);
     }
 
+    pub(crate) fn error_count(&self) -> usize {
+        self.list
+            .iter()
+            .filter(|f| f.severity == Severity::Error)
+            .count()
+    }
+
     pub(crate) fn has_errors(&self) -> bool {
         self.list.iter().any(|f| f.severity == Severity::Error)
     }

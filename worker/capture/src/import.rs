@@ -68,8 +68,13 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
         None => Model::default(),
     };
     let registered = check_names(&model, &mut faults);
+    // Of a model that was read in part, what seems to be missing in it tells nothing.
+    let model_is_whole = model.has_all_images && registered.len() == model.images.len();
     let (candidates, has_masks) = check_photographs(dir, &model, &registered, &mut faults);
-    let held_out_names = held_out_names(dir, &settings, &registered, &mut faults);
+    if model_is_whole {
+        report_unregistered(&dir.join("images"), &registered, &mut faults);
+    }
+    let held_out_names = held_out_names(dir, &settings, &registered, model_is_whole, &mut faults);
     // Counting views makes sense only when none of them is missing for another reason.
     let views_are_complete = !faults.has_errors();
 
@@ -235,7 +240,8 @@ fn error_chain(error: &dyn std::error::Error) -> String {
         }
         source = inner.source();
     }
-    text
+    // Decoders end their messages with a full stop; ours go on behind them.
+    text.trim_end_matches('.').to_owned()
 }
 
 /// The model's images by name, in path order, without those whose entry is faulty by itself.
@@ -308,9 +314,6 @@ fn check_photographs(
     for (candidate, found) in checked {
         candidates.extend(candidate);
         faults.extend(found.into_list());
-    }
-    if images_exist && !registered.is_empty() {
-        report_unregistered(&images, registered, faults);
     }
     (candidates, has_masks)
 }
@@ -478,10 +481,11 @@ fn check_picture(
 }
 
 /// Names of held-out views that the model has; `None` where the capture names none.
-fn held_out_names<'a>(
+fn held_out_names(
     dir: &Path,
-    settings: &'a Settings,
-    registered: &[&'a ModelImage],
+    settings: &Settings,
+    registered: &[&ModelImage],
+    model_is_whole: bool,
     faults: &mut Faults,
 ) -> Option<BTreeSet<String>> {
     let from_file = read_held_out(dir, faults);
@@ -523,6 +527,8 @@ fn held_out_names<'a>(
         let at = format!("{file}:{line}");
         if known.contains(name.as_str()) {
             kept.insert(name);
+        } else if !model_is_whole {
+            // It may well be in the part that could not be read.
         } else if settings::is_inside(Path::new(&name)) && dir.join("images").join(&name).is_file()
         {
             faults.warning(
@@ -530,7 +536,7 @@ fn held_out_names<'a>(
                 at,
                 "COLMAP did not register this photograph",
             );
-        } else if !known.is_empty() {
+        } else {
             let alike = known
                 .iter()
                 .find(|other| Path::new(other).file_stem() == Path::new(&name).file_stem());

@@ -22,6 +22,8 @@ pub(crate) struct Model {
     /// By camera id; `None` where the camera was there but has a fault.
     pub(crate) cameras: BTreeMap<u32, Option<SourceCamera>>,
     pub(crate) images: Vec<ModelImage>,
+    /// The list of images was read to its end, without a fault in it.
+    pub(crate) has_all_images: bool,
     pub(crate) points: Vec<ModelPoint>,
 }
 
@@ -113,6 +115,7 @@ pub(crate) fn read(dir: &Path, relative: &Path, faults: &mut Faults) -> Model {
             }
             continue;
         }
+        let errors_before = faults.error_count();
         match (part, extension) {
             ("cameras", "bin") => binary::cameras(&source, &mut model, faults),
             ("cameras", _) => text::cameras(&source, &mut model, faults),
@@ -120,6 +123,9 @@ pub(crate) fn read(dir: &Path, relative: &Path, faults: &mut Faults) -> Model {
             ("images", _) => text::images(&source, &mut model, faults),
             (_, "bin") => binary::points(&source, &mut model, faults),
             _ => text::points(&source, &mut model, faults),
+        }
+        if part == "images" {
+            model.has_all_images = faults.error_count() == errors_before;
         }
     }
     model
