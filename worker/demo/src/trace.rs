@@ -3,7 +3,7 @@
 //! Boxes are f32 and rounded outwards, triangles are tested in f64 (Moeller and Trumbore 1997), so no hit is lost to
 //! the boxes. Splits are by the surface area heuristic over bins.
 
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Vec3A};
 
 use crate::shape::Surface;
 
@@ -24,8 +24,8 @@ pub(crate) struct Tracer {
 /// Inner node: `count` is 0 and the children are `first` and `first + 1`. Leaf: triangles `first..first + count`.
 #[derive(Clone, Copy)]
 struct Node {
-    min: Vec3,
-    max: Vec3,
+    min: Vec3A,
+    max: Vec3A,
     first: u32,
     count: u32,
 }
@@ -57,9 +57,9 @@ pub(crate) struct Hit {
 
 /// A triangle while the tree is built.
 struct Item {
-    min: Vec3,
-    max: Vec3,
-    center: Vec3,
+    min: Vec3A,
+    max: Vec3A,
+    center: Vec3A,
     index: u32,
 }
 
@@ -68,7 +68,7 @@ impl Tracer {
         let mut items: Vec<Item> = Vec::with_capacity(surface.triangles.len());
         for (index, corners) in surface.triangles.iter().enumerate() {
             // Positions are f32 values: these boxes are exact.
-            let [a, b, c] = corners.map(|corner| surface.positions[corner as usize].as_vec3());
+            let [a, b, c] = corners.map(|corner| surface.positions[corner as usize].as_vec3a());
             let (min, max) = (a.min(b).min(c), a.max(b).max(c));
             items.push(Item {
                 min,
@@ -78,8 +78,8 @@ impl Tracer {
             });
         }
         let mut nodes = vec![Node {
-            min: Vec3::ZERO,
-            max: Vec3::ZERO,
+            min: Vec3A::ZERO,
+            max: Vec3A::ZERO,
             first: 0,
             count: 0,
         }];
@@ -127,8 +127,8 @@ impl Tracer {
 
     /// Visits triangles whose boxes the ray meets, near ones first; `visit` returns a new far limit after a hit.
     fn walk(&self, ray: Ray, mut visit: impl FnMut(&Triangle, f64) -> Option<f64>) {
-        let origin = ray.origin.as_vec3();
-        let inverse = ray.direction.as_vec3().recip();
+        let origin = ray.origin.as_vec3a();
+        let inverse = ray.direction.as_vec3a().recip();
         let mut t_max = ray.t_max;
         let mut stack = [(0_u32, 0.0_f32); STACK];
         let mut depth = 1;
@@ -177,7 +177,7 @@ impl Tracer {
 impl Node {
     /// Where the ray enters the box, if it does before `limit`. The box is widened by the rounding of f32.
     #[inline]
-    fn enter(&self, origin: Vec3, inverse: Vec3, limit: f32) -> Option<f32> {
+    fn enter(&self, origin: Vec3A, inverse: Vec3A, limit: f32) -> Option<f32> {
         let a = (self.min - origin) * inverse;
         let b = (self.max - origin) * inverse;
         let near = a.min(b).max_element().max(0.0);
@@ -187,8 +187,8 @@ impl Node {
             .then_some(near * (1.0 - 1e-5))
     }
 
-    fn area(min: Vec3, max: Vec3) -> f32 {
-        let e = (max - min).max(Vec3::ZERO);
+    fn area(min: Vec3A, max: Vec3A) -> f32 {
+        let e = (max - min).max(Vec3A::ZERO);
         e.x * e.y + e.y * e.z + e.z * e.x
     }
 }
@@ -223,7 +223,7 @@ impl Triangle {
 
 /// Fills `nodes[at]` for `items`, which become the leaves' triangles from `first` on, and reorders them.
 fn build(nodes: &mut Vec<Node>, at: usize, items: &mut [Item], first: u32) {
-    let mut bounds = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+    let mut bounds = (Vec3A::INFINITY, Vec3A::NEG_INFINITY);
     let mut centers = bounds;
     for item in items.iter() {
         bounds = (bounds.0.min(item.min), bounds.1.max(item.max));
@@ -256,14 +256,14 @@ fn build(nodes: &mut Vec<Node>, at: usize, items: &mut [Item], first: u32) {
 }
 
 /// Axis and place of the cheapest of the binned splits; `None` when all centres coincide.
-fn best_split(items: &[Item], centers: (Vec3, Vec3)) -> Option<(usize, f32)> {
+fn best_split(items: &[Item], centers: (Vec3A, Vec3A)) -> Option<(usize, f32)> {
     let mut best: Option<(f32, usize, f32)> = None;
     for axis in 0..3 {
         let (low, extent) = (centers.0[axis], centers.1[axis] - centers.0[axis]);
         if extent <= 0.0 {
             continue;
         }
-        let mut bins = [(0_u32, Vec3::INFINITY, Vec3::NEG_INFINITY); BINS];
+        let mut bins = [(0_u32, Vec3A::INFINITY, Vec3A::NEG_INFINITY); BINS];
         for item in items {
             let bin = (((item.center[axis] - low) / extent * BINS as f32) as usize).min(BINS - 1);
             let (count, min, max) = &mut bins[bin];
@@ -272,7 +272,7 @@ fn best_split(items: &[Item], centers: (Vec3, Vec3)) -> Option<(usize, f32)> {
             *max = max.max(item.max);
         }
         let sweep = |order: &mut dyn Iterator<Item = usize>| {
-            let (mut count, mut min, mut max) = (0, Vec3::INFINITY, Vec3::NEG_INFINITY);
+            let (mut count, mut min, mut max) = (0, Vec3A::INFINITY, Vec3A::NEG_INFINITY);
             let mut costs = Vec::with_capacity(BINS);
             for bin in order {
                 count += bins[bin].0;
