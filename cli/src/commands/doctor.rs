@@ -1,0 +1,307 @@
+//! `doctor`: looks at everything that a bake needs, and says what to do about what is missing.
+
+use std::path::Path;
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+
+use chrono::Utc;
+use ign_proto::v1;
+use serde::Serialize;
+
+use crate::Context;
+use crate::connection::{Connection, EndpointFile};
+use crate::output::{self, Table, bytes};
+use crate::problem::{Exit, Problem};
+use crate::supervise::find_worker;
+use crate::views::time;
+
+/// Less free space than this is worth a warning: one bake's work folder and bundle.
+const FREE_BYTES: u64 = 2_000_000_000;
+/// Clocks that differ by more confuse people who read times, though not leases.
+const SKEW_SECS: f64 = 5.0;
+
+/// Arguments of `doctor`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {}
+
+/// One thing that was looked at.
+#[derive(Debug, Serialize)]
+struct Check {
+    name: &'static str,
+    /// `ok`, `warn` or `failed`.
+    state: &'static str,
+    detail: String,
+    hint: Option<String>,
+}
+
+impl Check {
+    fn new(name: &'static str, state: &'static str, detail: impl Into<String>) -> Self {
+        Self {
+            name,
+            state,
+            detail: detail.into(),
+            hint: None,
+        }
+    }
+
+    fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hint = Some(hint.into());
+        self
+    }
+
+    fn problem(name: &'static str, state: &'static str, problem: &Problem) -> Self {
+        let at = if problem.at.is_empty() {
+            String::new()
+        } else {
+            format!(" ({})", problem.at)
+        };
+        let check = Self::new(name, state, format!("{}{at}", problem.what));
+        if problem.hint.is_empty() {
+            check
+        } else {
+            check.hint(problem.hint.clone())
+        }
+    }
+}
+
+pub(crate) async fn run(context: &Context, _args: &Args) -> Result<(), Problem> {
+    let mut checks = Vec::new();
+    let mut exit = Exit::Ok;
+    match Connection::open(&context.connection).await {
+        Ok(connection) => {
+            checks.push(Check::new(
+                "server",
+                "ok",
+                connection.target.url.to_string(),
+            ));
+            checks.push(store(&connection).await);
+            checks.extend(coordinator(&connection).await);
+        }
+        // Without a service, `bake` starts its own: only a server that was named must answer.
+        Err(problem) if problem.exit == Exit::Unreachable => {
+            let expected = context.connection.server.is_some() || named_but_silent(context);
+            checks.push(Check::problem(
+                "server",
+                if expected { "failed" } else { "warn" },
+                &problem,
+            ));
+            if expected {
+                exit = Exit::Unreachable;
+            }
+        }
+        Err(problem) => checks.push(Check::problem("server", "failed", &problem)),
+    }
+    if context.connection.server.is_none() {
+        let data = context.connection.data_dir()?;
+        checks.push(writable(&data));
+        checks.push(space(&data));
+        checks.push(worker().await);
+    }
+    output::data(context.format, &checks, || table(&checks))?;
+    let failed = checks
+        .iter()
+        .filter(|check| check.state == "failed")
+        .count();
+    if exit == Exit::Ok && failed > 0 {
+        exit = Exit::Failed;
+    }
+    match exit {
+        Exit::Ok => Ok(()),
+        exit => Err(Problem {
+            exit,
+            ..Problem::failed(format!("{failed} of {} checks failed", checks.len()))
+        }),
+    }
+}
+
+/// A process that should listen is there, but does not answer.
+fn named_but_silent(context: &Context) -> bool {
+    context
+        .connection
+        .data_dir()
+        .is_ok_and(|data| EndpointFile::of_live_service(&data).is_some())
+}
+
+async fn store(connection: &Connection) -> Check {
+    match connection.get_open("readyz").await {
+        Ok(answer) if answer.status().is_success() => {
+            Check::new("store", "ok", "database and object store answer")
+        }
+        Ok(answer) => {
+            let status = answer.status();
+            let said = answer.text().await.unwrap_or_default();
+            let said: String = said.trim().chars().take(300).collect();
+            let detail = if said.is_empty() {
+                status.to_string()
+            } else {
+                said
+            };
+            Check::new("store", "failed", detail).hint("look at the coordinator's log")
+        }
+        Err(problem) => Check::problem("store", "failed", &problem),
+    }
+}
+
+async fn coordinator(connection: &Connection) -> Vec<Check> {
+    let asked = Instant::now();
+    let status = match connection.jobs().status(v1::StatusRequest::default()).await {
+        Ok(status) => status.into_inner(),
+        Err(status) => return vec![Check::problem("token", "failed", &Problem::from(status))],
+    };
+    let half_way = asked.elapsed() / 2;
+    let mut checks = vec![Check::new("token", "ok", "accepted")];
+    let own = env!("CARGO_PKG_VERSION");
+    checks.push(if status.server_version == own {
+        Check::new("version", "ok", format!("{own} on both sides"))
+    } else {
+        Check::new(
+            "version",
+            "warn",
+            format!("ignctl {own}, coordinator {}", status.server_version),
+        )
+        .hint("install the same version on both sides")
+    });
+    let others: Vec<String> = status
+        .workers
+        .iter()
+        .filter(|worker| worker.version != status.server_version)
+        .map(|worker| format!("{} {}", worker.id, worker.version))
+        .collect();
+    checks.push(match (status.workers.len(), others.as_slice()) {
+        (0, _) => Check::new("workers", "warn", "none is connected")
+            .hint("ignctl up --workers N, or ign-worker agent on other machines"),
+        (count, []) => Check::new("workers", "ok", format!("{count} connected")),
+        (_, others) => Check::new(
+            "workers",
+            "warn",
+            format!("of another version: {}", others.join(", ")),
+        ),
+    });
+    if let Some(at) = time(status.at.as_ref()) {
+        let here = Utc::now() - chrono::Duration::from_std(half_way).unwrap_or_default();
+        let skew = (at - here).num_milliseconds() as f64 / 1000.0;
+        checks.push(if skew.abs() <= SKEW_SECS {
+            Check::new("clock", "ok", format!("{:.1} s apart", skew.abs()))
+        } else {
+            Check::new(
+                "clock",
+                "warn",
+                format!(
+                    "the coordinator's is {:.0} s {}",
+                    skew.abs(),
+                    if skew > 0.0 { "ahead" } else { "behind" }
+                ),
+            )
+            .hint("set both by NTP; leases go by the database's clock and are not affected")
+        });
+    }
+    checks
+}
+
+fn writable(data: &Path) -> Check {
+    // The folder may not exist yet: `up` creates it.
+    let probe = data.join(format!(".doctor-{}", std::process::id()));
+    let written = std::fs::create_dir_all(data)
+        .and_then(|()| std::fs::write(&probe, b"probe"))
+        .and_then(|()| std::fs::remove_file(&probe));
+    match written {
+        Ok(()) => Check::new("data folder", "ok", data.display().to_string()),
+        Err(error) => Check::new(
+            "data folder",
+            "failed",
+            format!("{}: {error}", data.display()),
+        )
+        .hint("give another folder by --data (IGN_DATA)"),
+    }
+}
+
+fn space(data: &Path) -> Check {
+    match rustix::fs::statvfs(data) {
+        Ok(stat) => {
+            let free = stat.f_bavail.saturating_mul(stat.f_frsize);
+            let state = if free < FREE_BYTES { "warn" } else { "ok" };
+            let check = Check::new("disk space", state, format!("{} free", bytes(free)));
+            if free < FREE_BYTES {
+                check.hint("make room before the next bake")
+            } else {
+                check
+            }
+        }
+        Err(error) => Check::new("disk space", "warn", format!("cannot tell: {error}")),
+    }
+}
+
+async fn worker() -> Check {
+    let program = match find_worker() {
+        Ok(program) => program,
+        Err(problem) => return Check::problem("worker", "failed", &problem),
+    };
+    let at = program.display().to_string();
+    let hint = "run `make setup`; it fetches libtorch, which the worker needs";
+    let run = tokio::process::Command::new(&program)
+        .arg("--version")
+        .stdin(Stdio::null())
+        .kill_on_drop(true)
+        .output();
+    match tokio::time::timeout(Duration::from_secs(30), run).await {
+        Ok(Ok(out)) if out.status.success() => {
+            let version = String::from_utf8_lossy(&out.stdout).trim().to_string();
+            let own = env!("CARGO_PKG_VERSION");
+            let state = if version.ends_with(own) { "ok" } else { "warn" };
+            Check::new("worker", state, format!("{version} ({at})"))
+        }
+        Ok(Ok(out)) => {
+            let said = String::from_utf8_lossy(&out.stderr);
+            let said = said.lines().last().unwrap_or("it says nothing").to_string();
+            Check::new("worker", "failed", format!("{at}: {}: {said}", out.status)).hint(hint)
+        }
+        Ok(Err(error)) => Check::new("worker", "failed", format!("{at}: {error}")).hint(hint),
+        Err(_) => Check::new(
+            "worker",
+            "failed",
+            format!("{at} does not answer within 30 s"),
+        )
+        .hint(hint),
+    }
+}
+
+fn table(checks: &[Check]) -> String {
+    let mut table = Table::new(&["CHECK", "STATE", "DETAIL"]);
+    for check in checks {
+        table.row(vec![
+            check.name.to_string(),
+            check.state.to_string(),
+            check.detail.clone(),
+        ]);
+    }
+    let mut text = table.to_string();
+    for check in checks {
+        if let Some(hint) = &check.hint {
+            text.push_str(&format!(
+                "hint ({}): {}\n",
+                check.name,
+                output::printable(hint)
+            ));
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn checks_come_with_what_to_do() {
+        let checks = [
+            Check::new("server", "ok", "http://127.0.0.1:7070/"),
+            Check::new(
+                "worker",
+                "failed",
+                "ign-worker: exit status: 127: cannot open libtorch_cpu.so",
+            )
+            .hint("run `make setup`"),
+        ];
+        insta::assert_snapshot!(table(&checks));
+    }
+}

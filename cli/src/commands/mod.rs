@@ -1,0 +1,11 @@
+//! The commands, one file per group.
+
+pub(crate) mod bake;
+pub(crate) mod bundle;
+pub(crate) mod completions;
+pub(crate) mod doctor;
+pub(crate) mod jobs;
+pub(crate) mod manifest;
+pub(crate) mod status;
+pub(crate) mod submit;
+pub(crate) mod up;

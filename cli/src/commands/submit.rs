@@ -1,0 +1,599 @@
+//! `submit`: queues captures, or checks them without sending anything.
+//!
+//! Request ids follow from content (object, capture, recipe, priority), so repeating a submit after a broken connection
+//! finds the jobs it had queued and sends no byte twice. One bad capture does not stop the others.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use chrono::{DateTime, Utc};
+use ign_capture::{Fault, ImportError, ImportOptions, Severity};
+use ign_proto::{CollectionId, ObjectName, v1};
+use serde::Serialize;
+
+use crate::Context;
+use crate::commands::{jobs, manifest};
+use crate::connection::Connection;
+use crate::output::{self, Table};
+use crate::pack;
+use crate::problem::{Exit, Problem, chain};
+use crate::recipe::RecipeArgs;
+use crate::upload::{self, Order};
+use crate::views::{JobView, ShortIds, short_id, time};
+
+/// Arguments of `submit`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Capture folders, or folders that hold captures
+    #[arg(
+        value_name = "PATH",
+        required_unless_present = "manifest",
+        conflicts_with = "manifest"
+    )]
+    paths: Vec<PathBuf>,
+    /// CSV list with the columns path, collection, object and optionally preset, size, priority
+    #[arg(long, value_name = "CSV")]
+    manifest: Option<PathBuf>,
+    /// Name of the object, for one capture
+    #[arg(long, value_name = "C/O", conflicts_with_all = ["manifest", "collection"])]
+    object: Option<ObjectName>,
+    /// Collection; the objects are named by capture.toml or by their folders
+    #[arg(long, value_name = "C", conflicts_with = "manifest")]
+    collection: Option<CollectionId>,
+    #[command(flatten)]
+    recipe: RecipeArgs,
+    /// Jobs of higher priority go first
+    #[arg(long, value_name = "N", default_value_t = 0, allow_hyphen_values = true, value_parser = clap::value_parser!(i32).range(-1000..=1000))]
+    priority: i32,
+    /// Check the captures and queue nothing
+    #[arg(long, conflicts_with_all = ["wait", "again"])]
+    dry_run: bool,
+    /// Wait until all jobs have ended
+    #[arg(long)]
+    wait: bool,
+    /// Queue a new job even where the same one was queued before
+    #[arg(long)]
+    again: bool,
+}
+
+/// What became of one capture.
+#[derive(Debug, Serialize)]
+struct RowView {
+    path: PathBuf,
+    collection: String,
+    object: String,
+    /// `submitted`, `known` (queued by an earlier submit) or `error`.
+    outcome: &'static str,
+    job: Option<JobView>,
+    error: Option<String>,
+}
+
+/// What preflight found in one capture.
+#[derive(Debug, Serialize)]
+struct CheckView {
+    path: PathBuf,
+    collection: String,
+    object: String,
+    ok: bool,
+    train_views: Option<usize>,
+    held_out_views: Option<usize>,
+    triangles: Option<usize>,
+    faults: Vec<Fault>,
+}
+
+pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
+    let orders = plan(args)?;
+    if args.dry_run {
+        return dry_run(context, orders).await;
+    }
+    let connection = Connection::open(&context.connection).await?;
+    let began = connection
+        .jobs()
+        .status(v1::StatusRequest::default())
+        .await?
+        .into_inner();
+    let began = time(began.at.as_ref()).unwrap_or_default();
+    let salt = if args.again {
+        Utc::now().timestamp_micros().to_string()
+    } else {
+        String::new()
+    };
+    let (mut rows, stopped) = submit_all(&connection, &orders, &salt, began).await;
+
+    let ids: Vec<String> = rows
+        .iter()
+        .filter_map(|row| row.job.as_ref())
+        .map(|job| job.id.clone())
+        .collect();
+    if args.wait && stopped.is_none() && !ids.is_empty() {
+        let ended = jobs::wait_for(&connection, ids, None).await?;
+        let mut ended = ended.iter().map(JobView::from);
+        for row in rows.iter_mut().filter(|row| row.job.is_some()) {
+            row.job = ended.next();
+        }
+    }
+    output::data(context.format, &rows, || table(&rows))?;
+    if let Some(problem) = stopped {
+        return Err(
+            problem.hint("submit the same again later: what was queued is not queued twice")
+        );
+    }
+    verdict(&rows, args.wait)
+}
+
+fn verdict(rows: &[RowView], waited: bool) -> Result<(), Problem> {
+    let refused = rows.iter().filter(|row| row.error.is_some()).count();
+    if refused > 0 {
+        return Err(Problem::failed(format!(
+            "{refused} of {} captures were not queued",
+            rows.len()
+        )));
+    }
+    if waited {
+        let jobs: Vec<JobView> = rows.iter().filter_map(|row| row.job.clone()).collect();
+        return jobs::verdict(&jobs);
+    }
+    Ok(())
+}
+
+/// All captures that the arguments name, each with its object; every fault of the arguments is found before anything
+/// is sent.
+fn plan(args: &Args) -> Result<Vec<Order>, Problem> {
+    let (orders, problems) = match &args.manifest {
+        Some(list) => plan_manifest(args, list)?,
+        None => plan_paths(args)?,
+    };
+    let mut problems = problems;
+    problems.extend(duplicates(&orders));
+    match problems.len() {
+        0 => Ok(orders),
+        1 => Err(problems.remove(0)),
+        count => {
+            for problem in &problems {
+                output::problem(problem);
+            }
+            Err(Problem::usage(format!("{count} faults; nothing was sent")))
+        }
+    }
+}
+
+type Planned = Result<(Vec<Order>, Vec<Problem>), Problem>;
+
+fn plan_manifest(args: &Args, list: &Path) -> Planned {
+    let rows = match manifest::read(list) {
+        Ok(rows) => rows,
+        Err(problems) => return Ok((Vec::new(), problems)),
+    };
+    let (mut orders, mut problems) = (Vec::new(), Vec::new());
+    for row in rows {
+        if let Err(problem) = pack::check_folder(&row.path) {
+            let at = format!("{}:{}", list.display(), row.line);
+            problems
+                .push(Problem::usage(format!("{} ({})", problem.what, row.path.display())).at(at));
+            continue;
+        }
+        let mut recipe = args.recipe.recipe(None)?;
+        recipe.preset = row.preset.unwrap_or(recipe.preset);
+        recipe.size = row.size.unwrap_or(recipe.size);
+        orders.push(Order {
+            capture: row.path,
+            proxy: None,
+            object: row.object,
+            recipe,
+            priority: row.priority.unwrap_or(args.priority),
+        });
+    }
+    Ok((orders, problems))
+}
+
+fn plan_paths(args: &Args) -> Planned {
+    let recipe = args.recipe.recipe(None)?;
+    let order = |capture: PathBuf, object: ObjectName| Order {
+        capture,
+        proxy: None,
+        object,
+        recipe: recipe.clone(),
+        priority: args.priority,
+    };
+    if let Some(object) = &args.object {
+        let [path] = args.paths.as_slice() else {
+            return Err(Problem::usage(
+                "--object names one object, but several captures are given",
+            )
+            .hint("use --collection, or a list with --manifest"));
+        };
+        pack::check_folder(path)?;
+        return Ok((vec![order(path.clone(), object.clone())], Vec::new()));
+    }
+    let (mut orders, mut problems) = (Vec::new(), Vec::new());
+    for path in &args.paths {
+        match captures_in(path) {
+            Ok(captures) => {
+                for capture in captures {
+                    match name(&capture, args.collection.as_ref()) {
+                        Ok(object) => orders.push(order(capture, object)),
+                        Err(problem) => problems.push(problem),
+                    }
+                }
+            }
+            Err(problem) => problems.push(problem),
+        }
+    }
+    Ok((orders, problems))
+}
+
+/// The folder itself when it looks like a capture, otherwise its children that do.
+fn captures_in(path: &Path) -> Result<Vec<PathBuf>, Problem> {
+    pack::check_folder(path)?;
+    if pack::looks_like_capture(path) {
+        return Ok(vec![path.to_path_buf()]);
+    }
+    let mut captures: Vec<PathBuf> = std::fs::read_dir(path)?
+        .filter_map(Result::ok)
+        .map(|entry| entry.path())
+        .filter(|child| child.is_dir() && pack::looks_like_capture(child))
+        .collect();
+    captures.sort();
+    if captures.is_empty() {
+        return Err(Problem::usage("neither a capture nor a folder of captures")
+            .at(path.display())
+            .hint("a capture has images/, sparse/ and a mesh; --object submits the folder all the same"));
+    }
+    Ok(captures)
+}
+
+/// `capture.toml`'s object, or the folder's name in the alphabet of object names.
+fn name(capture: &Path, collection: Option<&CollectionId>) -> Result<ObjectName, Problem> {
+    let written = pack::capture_toml(capture)
+        .and_then(|info| info.get("object")?.as_str().map(str::to_string));
+    if let Some(written) = written {
+        let named: ObjectName = written.parse().map_err(|error: ign_proto::IdError| {
+            Problem::usage(error.to_string()).at(capture.join("capture.toml").display())
+        })?;
+        return Ok(ObjectName {
+            collection: collection.cloned().unwrap_or(named.collection),
+            object: named.object,
+        });
+    }
+    let Some(collection) = collection else {
+        return Err(
+            Problem::usage("the capture does not say which object it is")
+                .at(capture.display())
+                .hint("give --object C/O, --collection C, or `object` in capture.toml"),
+        );
+    };
+    let folder = std::path::absolute(capture)?;
+    let folder = folder
+        .file_name()
+        .map(|name| name.to_string_lossy().into_owned())
+        .unwrap_or_default();
+    let object = slug(&folder).parse().map_err(|error: ign_proto::IdError| {
+        Problem::usage(error.to_string()).at(capture.display())
+    })?;
+    Ok(ObjectName {
+        collection: collection.clone(),
+        object,
+    })
+}
+
+fn slug(folder: &str) -> String {
+    let mapped: String = folder
+        .chars()
+        .map(|c| match c.to_ascii_lowercase() {
+            c if c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-') => c,
+            _ => '-',
+        })
+        .collect();
+    mapped
+        .trim_start_matches(['.', '_', '-'])
+        .trim_end_matches('-')
+        .chars()
+        .take(63)
+        .collect()
+}
+
+/// Two captures that would become the same object: one name is wrong, most likely by its case or its spaces.
+fn duplicates(orders: &[Order]) -> Vec<Problem> {
+    let mut seen: BTreeMap<&ObjectName, &Path> = BTreeMap::new();
+    let mut problems = Vec::new();
+    for order in orders {
+        if let Some(first) = seen.insert(&order.object, &order.capture) {
+            problems.push(
+                Problem::usage(format!("two captures for {}", order.object))
+                    .at(format!(
+                        "{} and {}",
+                        first.display(),
+                        order.capture.display()
+                    ))
+                    .hint("give them different names, or submit them one after the other"),
+            );
+        }
+    }
+    problems
+}
+
+/// Uploads and queues one after the other; ends early only when the coordinator is gone.
+async fn submit_all(
+    connection: &Connection,
+    orders: &[Order],
+    salt: &str,
+    began: DateTime<Utc>,
+) -> (Vec<RowView>, Option<Problem>) {
+    let mut rows = Vec::new();
+    for (index, order) in orders.iter().enumerate() {
+        let row = |outcome, job, error| RowView {
+            path: order.capture.clone(),
+            collection: order.object.collection.to_string(),
+            object: order.object.object.to_string(),
+            outcome,
+            job,
+            error,
+        };
+        let count = format!("{}/{}", index + 1, orders.len());
+        match submit_one(connection, order, salt).await {
+            Ok(job) => {
+                // The same request returns the same job: one from before this command began is an older submit's.
+                let known = time(job.submitted_at.as_ref()).is_some_and(|at| at < began);
+                let outcome = if known { "known" } else { "submitted" };
+                output::note(&format!(
+                    "{count}  {}  {outcome}, job {}",
+                    order.object,
+                    short_id(&job.id)
+                ));
+                rows.push(row(outcome, Some(JobView::from(&job)), None));
+            }
+            Err(problem) => {
+                output::problem(
+                    &problem
+                        .clone()
+                        .context(format!("{count}  {}", order.object)),
+                );
+                let stop = problem.exit == Exit::Unreachable;
+                rows.push(row("error", None, Some(problem.what.clone())));
+                if stop {
+                    return (rows, Some(problem));
+                }
+            }
+        }
+    }
+    (rows, None)
+}
+
+async fn submit_one(
+    connection: &Connection,
+    order: &Order,
+    salt: &str,
+) -> Result<v1::Job, Problem> {
+    let capture = upload::upload(connection, order).await?;
+    let spec = upload::spec(order, &capture)?;
+    let request_id = upload::request_id(&spec, salt);
+    upload::submit(connection, spec, request_id).await
+}
+
+fn table(rows: &[RowView]) -> String {
+    let jobs = || rows.iter().filter_map(|row| row.job.as_ref());
+    let ids = ShortIds::of(jobs().map(|job| job.id.as_str()));
+    let mut table = Table::new(&["CAPTURE", "OBJECT", "OUTCOME", "JOB", "STATE", "NOTE"]);
+    for row in rows {
+        let job = row.job.as_ref();
+        table.row(vec![
+            row.path.display().to_string(),
+            format!("{}/{}", row.collection, row.object),
+            row.outcome.to_string(),
+            job.map_or_else(|| "-".to_string(), |job| ids.show(&job.id)),
+            job.map_or("-", |job| job.state_for_people()).to_string(),
+            row.error
+                .clone()
+                .or_else(|| job.map(JobView::note))
+                .unwrap_or_default(),
+        ]);
+    }
+    table.to_string()
+}
+
+async fn dry_run(context: &Context, orders: Vec<Order>) -> Result<(), Problem> {
+    let mut checks = Vec::new();
+    let total = orders.len();
+    for (index, order) in orders.into_iter().enumerate() {
+        output::note(&format!(
+            "{}/{total}  checking {}",
+            index + 1,
+            order.capture.display()
+        ));
+        let check = tokio::task::spawn_blocking(move || check(&order))
+            .await
+            .map_err(|error| Problem::failed(format!("the check stopped: {error}")))?;
+        checks.push(check);
+    }
+    output::data(context.format, &checks, || check_table(&checks))?;
+    let bad = checks.iter().filter(|check| !check.ok).count();
+    if bad > 0 {
+        return Err(Problem::failed(format!(
+            "{bad} of {total} captures would fail"
+        )));
+    }
+    Ok(())
+}
+
+fn check(order: &Order) -> CheckView {
+    let mut view = CheckView {
+        path: order.capture.clone(),
+        collection: order.object.collection.to_string(),
+        object: order.object.object.to_string(),
+        ok: false,
+        train_views: None,
+        held_out_views: None,
+        triangles: None,
+        faults: Vec::new(),
+    };
+    match ign_capture::import(&order.capture, &ImportOptions::default()) {
+        Ok(scene) => {
+            view.ok = true;
+            view.train_views = Some(scene.train.len());
+            view.held_out_views = Some(scene.held_out.len());
+            view.triangles = Some(scene.mesh.triangles.len());
+            view.faults = scene.warnings;
+        }
+        Err(ImportError::Faults(faults)) => view.faults = faults,
+        Err(error) => view.faults.push(Fault {
+            severity: Severity::Error,
+            message: chain(&error),
+            at: String::new(),
+            hint: String::new(),
+        }),
+    }
+    view
+}
+
+fn check_table(checks: &[CheckView]) -> String {
+    let mut table = Table::new(&[
+        "CAPTURE",
+        "OBJECT",
+        "STATE",
+        ">TRAIN",
+        ">HELD OUT",
+        ">ERRORS",
+        ">WARNINGS",
+    ]);
+    let count = |check: &CheckView, severity| {
+        check
+            .faults
+            .iter()
+            .filter(|fault| fault.severity == severity)
+            .count()
+    };
+    let figure =
+        |value: Option<usize>| value.map_or_else(|| "-".to_string(), |value| value.to_string());
+    for check in checks {
+        table.row(vec![
+            check.path.display().to_string(),
+            format!("{}/{}", check.collection, check.object),
+            if check.ok { "ok" } else { "failed" }.to_string(),
+            figure(check.train_views),
+            figure(check.held_out_views),
+            count(check, Severity::Error).to_string(),
+            count(check, Severity::Warning).to_string(),
+        ]);
+    }
+    let mut text = table.to_string();
+    for check in checks.iter().filter(|check| !check.faults.is_empty()) {
+        text.push_str(&format!(
+            "\n{}\n",
+            output::printable(&check.path.display().to_string())
+        ));
+        for fault in &check.faults {
+            let label = match fault.severity {
+                Severity::Error => "error",
+                Severity::Warning => "warning",
+            };
+            for (label, line) in [
+                (label, &fault.message),
+                ("at", &fault.at),
+                ("hint", &fault.hint),
+            ] {
+                if !line.is_empty() {
+                    text.push_str(&format!("  {label:>7}: {}\n", output::printable(line)));
+                }
+            }
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn capture(parent: &Path, name: &str) -> PathBuf {
+        let dir = parent.join(name);
+        std::fs::create_dir_all(dir.join("images")).unwrap();
+        dir
+    }
+
+    #[test]
+    fn folders_become_object_names() {
+        let collection: CollectionId = "museum".parse().unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let named = |folder: &str| {
+            name(&capture(dir.path(), folder), Some(&collection)).map(|name| name.to_string())
+        };
+        assert_eq!(named("Vase 12").unwrap(), "museum/vase-12");
+        assert_eq!(named("_Büste").unwrap(), "museum/b-ste");
+        assert_eq!(named("---").unwrap_err().exit, Exit::Usage);
+        let written = capture(dir.path(), "x");
+        std::fs::write(written.join("capture.toml"), "object = \"greek/krater\"\n").unwrap();
+        assert_eq!(name(&written, None).unwrap().to_string(), "greek/krater");
+        assert_eq!(
+            name(&written, Some(&collection)).unwrap().to_string(),
+            "museum/krater"
+        );
+        assert_eq!(
+            name(&capture(dir.path(), "y"), None).unwrap_err().exit,
+            Exit::Usage
+        );
+    }
+
+    #[test]
+    fn a_folder_of_captures_gives_its_children() {
+        let dir = tempfile::tempdir().unwrap();
+        let empty = captures_in(dir.path()).unwrap_err();
+        assert_eq!(empty.exit, Exit::Usage);
+        let (b, a) = (capture(dir.path(), "b"), capture(dir.path(), "a"));
+        std::fs::create_dir(dir.path().join("notes")).unwrap();
+        assert_eq!(captures_in(dir.path()).unwrap(), [a.clone(), b]);
+        assert_eq!(captures_in(&a).unwrap(), [a]);
+    }
+
+    #[test]
+    fn names_that_differ_only_by_case_are_caught() {
+        let dir = tempfile::tempdir().unwrap();
+        let collection: CollectionId = "museum".parse().unwrap();
+        let recipe = serde_json::from_str(
+            r#"{"preset":"standard","size":256,"crop":"object","seed":0,"budget_secs":null,"proxy":null,"settings":{}}"#,
+        );
+        let recipe: crate::recipe::Recipe = recipe.unwrap();
+        let orders: Vec<Order> = ["Vase", "vase"]
+            .map(|folder| {
+                let capture = capture(dir.path(), folder);
+                Order {
+                    object: name(&capture, Some(&collection)).unwrap(),
+                    capture,
+                    proxy: None,
+                    recipe: recipe.clone(),
+                    priority: 0,
+                }
+            })
+            .into();
+        assert_eq!(duplicates(&orders).len(), 1);
+    }
+
+    #[test]
+    fn a_dry_run_lists_every_fault() {
+        let fault = |severity, message: &str| Fault {
+            severity,
+            message: message.into(),
+            at: "sparse/0/cameras.txt:7".into(),
+            hint: "re-export with PINHOLE".into(),
+        };
+        let check = |ok: bool, faults| CheckView {
+            path: "captures/vase".into(),
+            collection: "museum".into(),
+            object: "vase".into(),
+            ok,
+            train_views: ok.then_some(120),
+            held_out_views: ok.then_some(24),
+            triangles: ok.then_some(5000),
+            faults,
+        };
+        insta::assert_snapshot!(check_table(&[
+            check(true, vec![]),
+            check(
+                false,
+                vec![
+                    fault(Severity::Error, "camera 3 has zero focal length"),
+                    fault(Severity::Warning, "view a.jpg has no mask"),
+                ]
+            ),
+        ]));
+    }
+}

@@ -1,0 +1,86 @@
+//! `up`: the whole service on this machine, in the foreground.
+
+use std::net::SocketAddr;
+
+use crate::Context;
+use crate::embedded::{Embedded, Options, interrupted};
+use crate::output;
+use crate::problem::Problem;
+
+/// Arguments of `up`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Worker processes; each bakes one job at a time
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = workers)]
+    workers: usize,
+    /// Threads per worker [default: the cores, shared among the workers]
+    #[arg(long, value_name = "N", value_parser = threads)]
+    threads: Option<usize>,
+    /// Address to listen on; port 0 takes a free one
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
+    listen: SocketAddr,
+}
+
+fn workers(text: &str) -> Result<usize, String> {
+    text.parse()
+        .ok()
+        .filter(|n| *n <= 256)
+        .ok_or_else(|| "expected 0 to 256".to_string())
+}
+
+fn threads(text: &str) -> Result<usize, String> {
+    text.parse()
+        .ok()
+        .filter(|n| (1..=1024).contains(n))
+        .ok_or_else(|| "expected 1 to 1024".to_string())
+}
+
+pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .with_ansi(false)
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::try_from_default_env()
+                .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn")),
+        )
+        .init();
+    let options = Options {
+        data: context.connection.data_dir()?,
+        workers: args.workers,
+        threads: args.threads,
+        listen: args.listen,
+        give_up: false,
+    };
+    let mut service = Embedded::start(&options).await?;
+    if !args.listen.ip().is_loopback() {
+        output::warn(
+            "listening beyond this machine without TLS: anyone on the way can read the token",
+        );
+    }
+    let plural =
+        |count: usize, noun: &str| format!("{count} {noun}{}", if count == 1 { "" } else { "s" });
+    output::note(&output::pairs(&[
+        ("listening", service.target.url.to_string()),
+        ("data", options.data.display().to_string()),
+        ("token", options.data.join("token").display().to_string()),
+        (
+            "workers",
+            format!(
+                "{}, {} each",
+                plural(options.workers, "worker"),
+                plural(service.threads, "thread")
+            ),
+        ),
+        ("logs", service.logs.display().to_string()),
+    ]));
+    output::note(
+        "Ctrl-C ends the service; running jobs go on from their last checkpoint when it starts again",
+    );
+    let ended = tokio::select! {
+        signal = interrupted() => signal,
+        problem = service.broken() => Err(problem),
+    };
+    output::note("ending");
+    let stopped = service.stop().await;
+    ended.and(stopped)
+}

@@ -1,0 +1,131 @@
+//! The recipe: what to train, as the command line says it and as the worker reads it.
+//!
+//! The worker owns the schema; ignctl checks only what it names itself, and hands `--set` through.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::problem::Problem;
+
+/// How to bake.
+#[derive(Clone, Debug, clap::Args)]
+#[command(next_help_heading = "Recipe")]
+pub(crate) struct RecipeArgs {
+    /// What to train: `standard`, or `paper` for the published method
+    #[arg(long, value_parser = ["standard", "paper"], default_value = "standard")]
+    pub(crate) preset: String,
+    /// Longer side of the rendered images, in pixels
+    #[arg(long, value_name = "PX", default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=8192))]
+    pub(crate) size: u32,
+    /// A setting of the preset, or `crop=none` to keep the whole frame; may be given again
+    #[arg(long, value_name = "KEY=VALUE", value_parser = key_value)]
+    pub(crate) set: Vec<(String, String)>,
+    /// Stop training after about so many seconds and keep the best so far
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub(crate) budget_secs: Option<u64>,
+    /// Seed of everything random
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) seed: u64,
+}
+
+/// The recipe on the wire.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Recipe {
+    pub(crate) preset: String,
+    pub(crate) size: u32,
+    pub(crate) crop: String,
+    pub(crate) seed: u64,
+    pub(crate) budget_secs: Option<u64>,
+    pub(crate) proxy: Option<String>,
+    pub(crate) settings: BTreeMap<String, String>,
+}
+
+fn key_value(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.trim().is_empty() => {
+            Ok((key.trim().to_string(), value.trim().to_string()))
+        }
+        _ => Err("expected KEY=VALUE".to_string()),
+    }
+}
+
+impl RecipeArgs {
+    /// The recipe, with the proxy's path within the capture.
+    pub(crate) fn recipe(&self, proxy: Option<String>) -> Result<Recipe, Problem> {
+        let mut recipe = Recipe {
+            preset: self.preset.clone(),
+            size: self.size,
+            crop: "object".to_string(),
+            seed: self.seed,
+            budget_secs: self.budget_secs,
+            proxy,
+            settings: BTreeMap::new(),
+        };
+        for (key, value) in &self.set {
+            match key.as_str() {
+                "crop" if matches!(value.as_str(), "object" | "none") => {
+                    recipe.crop.clone_from(value)
+                }
+                "crop" => {
+                    return Err(Problem::usage(format!("crop is {value:?}"))
+                        .hint("--set crop=object (default) or --set crop=none"));
+                }
+                "preset" | "size" | "seed" | "budget_secs" | "proxy" => {
+                    return Err(Problem::usage(format!("{key} is not a setting"))
+                        .hint(format!("use --{} instead", key.replace('_', "-"))));
+                }
+                _ => {
+                    recipe.settings.insert(key.clone(), value.clone());
+                }
+            }
+        }
+        Ok(recipe)
+    }
+}
+
+impl Recipe {
+    /// Canonical JSON: fields in a fixed order, settings sorted.
+    pub(crate) fn json(&self) -> Result<String, Problem> {
+        serde_json::to_string(self)
+            .map_err(|error| Problem::failed(format!("cannot write the recipe: {error}")))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::problem::Exit;
+
+    fn args(set: &[&str]) -> RecipeArgs {
+        RecipeArgs {
+            preset: "standard".into(),
+            size: 128,
+            set: set.iter().map(|text| key_value(text).unwrap()).collect(),
+            budget_secs: Some(60),
+            seed: 7,
+        }
+    }
+
+    #[test]
+    fn crop_has_its_own_field_and_the_rest_are_settings() {
+        let recipe = args(&["lr=1e-3", "crop=none", "epochs=3"]).recipe(Some("proxy/p.ply".into()));
+        insta::assert_snapshot!(
+            recipe.unwrap().json().unwrap(),
+            @r#"{"preset":"standard","size":128,"crop":"none","seed":7,"budget_secs":60,"proxy":"proxy/p.ply","settings":{"epochs":"3","lr":"1e-3"}}"#
+        );
+    }
+
+    #[test]
+    fn what_has_a_flag_is_not_a_setting() {
+        for wrong in ["crop=middle", "size=3", "budget_secs=3"] {
+            assert_eq!(
+                args(&[wrong]).recipe(None).unwrap_err().exit,
+                Exit::Usage,
+                "{wrong}"
+            );
+        }
+        assert!(key_value("epochs").is_err());
+        assert!(key_value("=3").is_err());
+    }
+}
