@@ -86,7 +86,7 @@ async fn run(
             let Some(path) = offered.borrow_and_update().clone() else {
                 break;
             };
-            let problem = match send(&control, &data, &state, &path, &mut session).await {
+            let problem = match send(&control, &data, &state, &path, &session).await {
                 Ok(size_bytes) => {
                     let megabytes = size_bytes as f64 / 1e6;
                     state.log(
@@ -155,7 +155,7 @@ async fn send(
     data: &DataPlane,
     state: &State,
     path: &Path,
-    session: &mut UploadSession,
+    session: &UploadSession,
 ) -> Result<u64, Problem> {
     let (digest, size_bytes): (Digest, u64) = {
         let path = path.to_path_buf();

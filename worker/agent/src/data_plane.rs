@@ -5,6 +5,7 @@
 
 use std::io::SeekFrom;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use futures::StreamExt;
@@ -39,17 +40,22 @@ pub(crate) enum Pushed {
     Sent,
 }
 
-/// An upload that broke off, to be gone on with.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct UploadSession(Option<Url>);
+/// The upload of one blob: where to go on with it after it broke off.
+#[derive(Debug, Default)]
+pub(crate) struct UploadSession(Mutex<Option<Url>>);
 
 impl UploadSession {
+    fn set(&self, location: Option<Url>) -> Option<Url> {
+        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut known, location)
+    }
+
     /// Sorts an error in the middle of an upload. What the server refuses here is about this upload, not about the
     /// blob: a new one may go well.
-    fn broke_off(&mut self, error: TransferError) -> TransferError {
+    fn broke_off(&self, error: TransferError) -> TransferError {
         match error {
             TransferError::Missing { what } => {
-                self.0 = None;
+                self.set(None);
                 let reason = "the server no longer knows the upload".to_owned();
                 TransferError::Unavailable { what, reason }
             }
@@ -60,7 +66,7 @@ impl UploadSession {
             } => {
                 // After 416 the server still has the upload and tells how far it is.
                 if status != 416 {
-                    self.0 = None;
+                    self.set(None);
                 }
                 let reason = format!("status {status}: {body}");
                 TransferError::Damaged { what, reason }
@@ -220,7 +226,7 @@ impl DataPlane {
         file: &Path,
         digest: &Digest,
         size_bytes: u64,
-        session: &mut UploadSession,
+        session: &UploadSession,
     ) -> Result<Pushed, TransferError> {
         let what = format!("blob {digest}");
         let blob = self.url(object, &format!("blobs/{digest}"));
@@ -253,7 +259,7 @@ impl DataPlane {
             if let Some(next) = self.location(&response) {
                 location = next;
             }
-            session.0 = Some(location.clone());
+            session.set(Some(location.clone()));
         }
         let mut finish = location;
         finish
@@ -270,19 +276,19 @@ impl DataPlane {
     async fn upload_state(
         &self,
         uploads: &Url,
-        session: &mut UploadSession,
+        session: &UploadSession,
         what: &str,
     ) -> Result<(Url, u64), TransferError> {
-        if let Some(known) = session.0.take() {
+        if let Some(known) = session.set(None) {
             match send(self.http.get(known.clone()), what).await {
                 Ok(response) => {
                     let offset = received_bytes(&response).unwrap_or(0);
                     let location = self.location(&response).unwrap_or(known);
-                    session.0 = Some(location.clone());
+                    session.set(Some(location.clone()));
                     return Ok((location, offset));
                 }
                 Err(error) if error.is_passing() => {
-                    session.0 = Some(known);
+                    session.set(Some(known));
                     return Err(error);
                 }
                 // Forgotten: begin again.
@@ -296,7 +302,7 @@ impl DataPlane {
                 what: what.to_owned(),
                 reason: "the server gave no usable upload location".to_owned(),
             })?;
-        session.0 = Some(location.clone());
+        session.set(Some(location.clone()));
         Ok((location, 0))
     }
 

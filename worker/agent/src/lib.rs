@@ -244,3 +244,23 @@ fn default_name(hostname: &str) -> String {
     let host = if host.is_empty() { "worker" } else { host };
     format!("{host}-{}", std::process::id())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_agent_runs_on_any_executor() {
+        fn needs_send(_future: impl Send) {}
+        let config = AgentConfig::new("http://127.0.0.1:1", "token", Path::new("/x")).unwrap();
+        needs_send(run(config, CancellationToken::new()));
+    }
+
+    #[test]
+    fn default_names_are_names() {
+        for host in ["", "--", "Museum_3.lan", "h\u{f6}st"] {
+            let name = default_name(host);
+            assert!(name.parse::<WorkerId>().is_ok(), "{name}");
+        }
+    }
+}

@@ -8,7 +8,8 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
-use futures::{StreamExt, TryStreamExt};
+use futures::future::BoxFuture;
+use futures::{FutureExt, StreamExt, TryStreamExt};
 use ign_proto::{Digest, FileEntry, FilePath, Kind, Manifest, ObjectName};
 use tokio::time::Instant;
 
@@ -47,9 +48,7 @@ impl Transfer<'_> {
     ) -> Result<(), TransferError> {
         let moved = AtomicU64::new(0);
         let bytes = self
-            .persist(&moved, async || {
-                self.data.manifest(self.object, digest).await
-            })
+            .persist(&moved, || self.data.manifest(self.object, digest).boxed())
             .await?;
         let unusable = |reason: String| TransferError::Manifest {
             digest: digest.to_string(),
@@ -85,11 +84,10 @@ impl Transfer<'_> {
                 total.div_ceil(1_000_000)
             ));
         };
-        futures::stream::iter(&missing)
-            .map(|(digest, size)| self.fetch(digest, Some(*size), &moved, &received))
-            .buffer_unordered(PARALLEL)
-            .try_collect::<()>()
-            .await?;
+        let fetches = missing
+            .iter()
+            .map(|(digest, size)| self.fetch(digest, Some(*size), &moved, &received).boxed());
+        all(fetches.collect()).await?;
         let (cache, dir) = (self.cache.clone(), dir.to_path_buf());
         let digest = digest.to_string();
         files::blocking(move || lay_out(&cache, &manifest, &digest, &dir)).await?
@@ -131,10 +129,10 @@ impl Transfer<'_> {
         received: &(dyn Fn(u64) + Sync),
     ) -> Result<(), TransferError> {
         let partial = self.cache.partial(digest);
-        self.persist(moved, async || {
+        self.persist(moved, || {
             self.data
                 .fetch(self.object, digest, size_bytes, &partial, received)
-                .await
+                .boxed()
         })
         .await?;
         self.cache.commit(digest)
@@ -145,20 +143,19 @@ impl Transfer<'_> {
         let root = dir.to_path_buf();
         let entries = files::blocking(move || bundle_files(&root)).await??;
         let sent = AtomicUsize::new(0);
-        futures::stream::iter(&entries)
-            .map(|entry| async {
+        let count = entries.len();
+        let sends = entries.iter().map(|entry| {
+            let sent = &sent;
+            async move {
                 let path = dir.join(entry.path.as_str());
                 self.send(&path, &entry.digest, entry.size_bytes).await?;
                 let sent = sent.fetch_add(1, Ordering::Relaxed) + 1;
-                (self.progress)(&format!(
-                    "sending the bundle: {sent} of {} files",
-                    entries.len()
-                ));
-                Ok::<(), TransferError>(())
-            })
-            .buffer_unordered(PARALLEL)
-            .try_collect::<()>()
-            .await?;
+                (self.progress)(&format!("sending the bundle: {sent} of {count} files"));
+                Ok(())
+            }
+            .boxed()
+        });
+        all(sends.collect()).await?;
         Ok(entries)
     }
 
@@ -168,22 +165,22 @@ impl Transfer<'_> {
         digest: &Digest,
         size_bytes: u64,
     ) -> Result<(), TransferError> {
-        let mut session = UploadSession::default();
+        let session = UploadSession::default();
         let moved = AtomicU64::new(0);
-        self.persist(&moved, async || {
+        self.persist(&moved, || {
             self.data
-                .push(self.object, path, digest, size_bytes, &mut session)
-                .await
+                .push(self.object, path, digest, size_bytes, &session)
+                .boxed()
         })
         .await?;
         Ok(())
     }
 
     /// Tries until it goes well, fails for good, or nothing `moved` for a long time.
-    async fn persist<T>(
+    async fn persist<'a, T>(
         &self,
         moved: &AtomicU64,
-        mut attempt: impl AsyncFnMut() -> Result<T, TransferError>,
+        attempt: impl Fn() -> BoxFuture<'a, Result<T, TransferError>>,
     ) -> Result<T, TransferError> {
         let mut backoff = Backoff::default();
         let mut damaged = 0;
@@ -209,6 +206,16 @@ impl Transfer<'_> {
             tokio::time::sleep(backoff.next_delay()).await;
         }
     }
+}
+
+/// Runs transfers side by side until all are done or one fails.
+async fn all(
+    transfers: Vec<BoxFuture<'_, Result<(), TransferError>>>,
+) -> Result<(), TransferError> {
+    futures::stream::iter(transfers)
+        .buffer_unordered(PARALLEL)
+        .try_collect()
+        .await
 }
 
 /// Links the cached files under their names.

@@ -7,7 +7,6 @@ use std::io::{Read, Write};
 use std::path::Path;
 
 use ign_events::{Event, Failure, FailureKind, JobFile, Level, Progress};
-use serde_json::Value;
 
 fn emit(event: &Event) {
     let mut stdout = std::io::stdout().lock();

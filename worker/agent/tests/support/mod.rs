@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes};
-use axum::extract::{Path, Query, Request, State};
+use axum::extract::{DefaultBodyLimit, Path, Query, Request, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
@@ -16,53 +16,53 @@ use ign_proto::{Cause, Digest, FileEntry, JobId, Kind, Manifest, v1};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
-pub const TOKEN: &str = "secret";
+pub(crate) const TOKEN: &str = "secret";
 const LEASE_SECS: f64 = 1.0;
 
 /// How an attempt ended, as the coordinator heard it.
 #[derive(Clone, Debug)]
-pub enum End {
+pub(crate) enum End {
     Completed(v1::CompleteRequest),
     Failed(v1::Failure),
 }
 
 #[derive(Default)]
-pub struct World {
-    pub queue: VecDeque<v1::Lease>,
-    pub blobs: HashMap<String, Vec<u8>>,
+pub(crate) struct World {
+    pub(crate) queue: VecDeque<v1::Lease>,
+    pub(crate) blobs: HashMap<String, Vec<u8>>,
     manifests: HashMap<String, Vec<u8>>,
     uploads: HashMap<String, Vec<u8>>,
-    pub ends: Vec<(String, End)>,
-    pub logs: Vec<String>,
-    pub progress: Vec<v1::Progress>,
-    pub checkpoints: Vec<String>,
+    pub(crate) ends: Vec<(String, End)>,
+    pub(crate) logs: Vec<String>,
+    pub(crate) progress: Vec<v1::Progress>,
+    pub(crate) checkpoints: Vec<String>,
     /// Method, path and Range or Content-Range of every data plane request.
-    pub requests: Vec<String>,
-    pub heartbeats: usize,
-    pub cancel: HashSet<String>,
-    pub lost: HashSet<String>,
-    pub drain: bool,
+    pub(crate) requests: Vec<String>,
+    pub(crate) heartbeats: usize,
+    pub(crate) cancel: HashSet<String>,
+    pub(crate) lost: HashSet<String>,
+    pub(crate) drain: bool,
     /// Nothing is served.
-    pub down: bool,
+    pub(crate) down: bool,
     /// The next blob downloads break off after this many bytes.
-    pub cut_downloads: VecDeque<usize>,
+    pub(crate) cut_downloads: VecDeque<usize>,
     /// This many of the next PATCH requests are stored and then answered with an error.
-    pub lose_patch_answers: usize,
+    pub(crate) lose_patch_answers: usize,
     /// Forget this many uploads at their next PATCH.
-    pub forget_uploads: usize,
+    pub(crate) forget_uploads: usize,
     /// Blobs arrive changed.
-    pub damage: bool,
-    pub blob_missing_answers: usize,
+    pub(crate) damage: bool,
+    pub(crate) blob_missing_answers: usize,
 }
 
 #[derive(Clone)]
-pub struct Coordinator {
+pub(crate) struct Coordinator {
     world: Arc<Mutex<World>>,
-    pub url: String,
+    pub(crate) url: String,
 }
 
 impl Coordinator {
-    pub async fn start() -> Self {
+    pub(crate) async fn start() -> Self {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let url = format!("http://{}", listener.local_addr().unwrap());
         let coordinator = Self {
@@ -75,6 +75,7 @@ impl Coordinator {
             .route("/v2/{c}/{o}/blobs/{digest}", any(blob))
             .route("/v2/{c}/{o}/blobs/uploads/", any(start_upload))
             .route("/v2/{c}/{o}/blobs/uploads/{id}", any(upload))
+            .layer(DefaultBodyLimit::disable())
             .with_state(coordinator.clone())
             .merge(grpc.into_axum_router())
             .layer(middleware::from_fn_with_state(coordinator.clone(), gate));
@@ -82,12 +83,12 @@ impl Coordinator {
         coordinator
     }
 
-    pub fn world(&self) -> MutexGuard<'_, World> {
+    pub(crate) fn world(&self) -> MutexGuard<'_, World> {
         self.world.lock().unwrap()
     }
 
     /// Stores a capture and returns the digest of its manifest.
-    pub fn add_capture(&self, files: &[(&str, &[u8])]) -> String {
+    pub(crate) fn add_capture(&self, files: &[(&str, &[u8])]) -> String {
         let mut world = self.world();
         let entries = files
             .iter()
@@ -111,7 +112,7 @@ impl Coordinator {
         digest
     }
 
-    pub fn add_manifest(&self, bytes: &[u8]) -> String {
+    pub(crate) fn add_manifest(&self, bytes: &[u8]) -> String {
         let digest = Digest::of(bytes).to_string();
         self.world()
             .manifests
@@ -119,13 +120,13 @@ impl Coordinator {
         digest
     }
 
-    pub fn queue(&self, capture: &str, script: &serde_json::Value) -> String {
+    pub(crate) fn queue(&self, capture: &str, script: &serde_json::Value) -> String {
         let job_id = JobId::generate().to_string();
         self.queue_attempt(&job_id, 1, capture, script, "");
         job_id
     }
 
-    pub fn queue_attempt(
+    pub(crate) fn queue_attempt(
         &self,
         job_id: &str,
         attempt: u32,
@@ -152,7 +153,7 @@ impl Coordinator {
     }
 
     /// Waits until `condition` holds.
-    pub async fn until(&self, what: &str, condition: impl Fn(&World) -> bool) {
+    pub(crate) async fn until(&self, what: &str, condition: impl Fn(&World) -> bool) {
         let started = Instant::now();
         while !condition(&self.world()) {
             if started.elapsed() > Duration::from_secs(40) {
@@ -166,7 +167,7 @@ impl Coordinator {
         }
     }
 
-    pub async fn end_of(&self, job: &str) -> End {
+    pub(crate) async fn end_of(&self, job: &str) -> End {
         self.until("end of the job", |world| {
             world.ends.iter().any(|(id, _)| id == job)
         })
@@ -261,10 +262,14 @@ async fn blob(
         return response.body(Body::from(body)).unwrap();
     };
     body.truncate(cut);
-    let pieces = [Ok(Bytes::from(body)), Err(std::io::Error::other("cut"))];
-    response
-        .body(Body::from_stream(futures::stream::iter(pieces)))
-        .unwrap()
+    let start = futures::stream::once(async { Ok(Bytes::from(body)) });
+    // The start arrives before the connection breaks.
+    let end = futures::stream::once(async {
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        Err(std::io::Error::other("cut"))
+    });
+    let body = Body::from_stream(futures::StreamExt::chain(start, end));
+    response.body(body).unwrap()
 }
 
 async fn start_upload(
@@ -432,13 +437,13 @@ impl Workers for Coordinator {
     }
 }
 
-pub struct Worker {
-    pub dir: tempfile::TempDir,
-    pub shutdown: CancellationToken,
-    pub task: JoinHandle<Result<(), AgentError>>,
+pub(crate) struct Worker {
+    pub(crate) dir: tempfile::TempDir,
+    pub(crate) shutdown: CancellationToken,
+    pub(crate) task: JoinHandle<Result<(), AgentError>>,
 }
 
-pub fn config(coordinator: &Coordinator, dir: &std::path::Path) -> AgentConfig {
+pub(crate) fn config(coordinator: &Coordinator, dir: &std::path::Path) -> AgentConfig {
     AgentConfig {
         name: Some("tester".into()),
         threads: 3,
@@ -453,7 +458,7 @@ pub fn config(coordinator: &Coordinator, dir: &std::path::Path) -> AgentConfig {
 }
 
 impl Worker {
-    pub fn start(coordinator: &Coordinator) -> Self {
+    pub(crate) fn start(coordinator: &Coordinator) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let shutdown = CancellationToken::new();
         let task = tokio::spawn(ign_agent::run(
@@ -468,7 +473,7 @@ impl Worker {
     }
 
     /// Stops the agent and checks that it left no job behind.
-    pub async fn stop(self) {
+    pub(crate) async fn stop(self) {
         self.shutdown.cancel();
         self.task.await.unwrap().unwrap();
         let jobs = std::fs::read_dir(self.dir.path().join("jobs")).unwrap();
@@ -477,14 +482,14 @@ impl Worker {
 }
 
 /// Whether a process exists and is no zombie.
-pub fn alive(pid: &str) -> bool {
+pub(crate) fn alive(pid: &str) -> bool {
     let state = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     !state.is_empty() && !state.contains(") Z ")
 }
 
 impl World {
     /// The rest of the first log line that begins so.
-    pub fn log_after(&self, start: &str) -> Option<String> {
+    pub(crate) fn log_after(&self, start: &str) -> Option<String> {
         self.logs
             .iter()
             .find_map(|line| line.strip_prefix(start))
