@@ -233,6 +233,87 @@ fn g_buffer_agrees_with_ray_casting() {
 }
 
 #[test]
+fn normals_by_differences_are_those_of_neighbouring_positions() {
+    let mesh = torus(28, 12);
+    // So near that all four borders of the image cut through the object.
+    let camera = camera(1.3, 0.4, 1.7);
+    let buffer = GBuffer::render(&mesh, &camera, 1);
+    let (width, height) = (buffer.width as i64, buffer.height as i64);
+    let at = |column: i64, row: i64| {
+        let inside = (0..width).contains(&column) && (0..height).contains(&row);
+        let index = (row * width + column) as usize;
+        (inside && buffer.mask[index]).then(|| surface_point(&buffer, index).0)
+    };
+    let mut borders = 0;
+    for (index, column, row) in pixels(&camera) {
+        let (column, row) = (i64::from(column), i64::from(row));
+        let Some(here) = at(column, row) else {
+            continue;
+        };
+        let step = |dx: i64, dy: i64| {
+            let after = at(column + dx, row + dy).unwrap_or(here);
+            after - at(column - dx, row - dy).unwrap_or(here)
+        };
+        let normal = step(1, 0).cross(step(0, 1)).normalize_or_zero();
+        let view = (here - camera.center()).normalize_or_zero();
+        // Next to the silhouette the plane of the neighbours may contain the viewing ray: no side is right there.
+        if normal == DVec3::ZERO || normal.dot(view).abs() < 1e-2 {
+            continue;
+        }
+        let normal = if normal.dot(view) > 0.0 {
+            -normal
+        } else {
+            normal
+        };
+        let fast = DVec3::from_array(buffer.normal_fd[index].map(f64::from));
+        // Positions are f32, differences a hundredth of them.
+        assert!((normal - fast).length() < 1e-4, "pixel ({column}, {row})");
+        borders += u32::from(column == 0) + u32::from(column == width - 1);
+    }
+    assert!(borders > 10, "the object leaves the image on both sides");
+}
+
+#[test]
+fn winding_does_not_matter() {
+    let mesh = torus(28, 12);
+    let mut mixed = mesh.clone();
+    for triangle in mixed.triangles.iter_mut().step_by(3) {
+        triangle.swap(1, 2);
+    }
+    let camera = camera(2.9, -0.5, 2.6);
+    let (straight, mixed) = (
+        GBuffer::render(&mesh, &camera, 2),
+        GBuffer::render(&mixed, &camera, 2),
+    );
+    assert!(straight.coverage == mixed.coverage && straight.triangle == mixed.triangle);
+    for (a, b) in straight
+        .normal
+        .iter()
+        .flatten()
+        .zip(mixed.normal.iter().flatten())
+    {
+        assert!((a - b).abs() < 1e-5);
+    }
+    // Nor does the sign of the normals that a file brought along.
+    let mut inverted = mesh.clone();
+    inverted
+        .normals
+        .iter_mut()
+        .for_each(|normal| *normal = -*normal);
+    let inverted = GBuffer::render(&inverted, &camera, 2);
+    let away = |index: &usize| {
+        let (a, b) = (
+            surface_point(&straight, *index).1,
+            surface_point(&inverted, *index).1,
+        );
+        (a - b).length() > 1e-5
+    };
+    let covered = straight.mask.iter().filter(|covered| **covered).count();
+    // But where an interpolated normal leans over the silhouette, the face decides its side.
+    assert!((0..straight.mask.len()).filter(away).count() * 100 <= covered);
+}
+
+#[test]
 fn normals_by_differences_follow_the_surface() {
     let mesh = torus(96, 48);
     let camera = camera(0.4, 0.8, 3.0);
