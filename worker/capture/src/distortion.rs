@@ -144,6 +144,9 @@ pub struct SourceCamera {
 /// Largest ray radius (tangent of the angle to the axis) that the scan for folding looks at.
 const RADIUS_SCANNED: f64 = 20.0;
 
+/// Largest photograph that is accepted: 512 megapixels.
+const MOST_PIXELS: u64 = 1 << 29;
+
 impl SourceCamera {
     /// From COLMAP's parameter list; `None` when the list has the wrong length.
     /// Values are taken as they are: see [`SourceCamera::fault`].
@@ -215,7 +218,7 @@ impl SourceCamera {
         Some(camera)
     }
 
-    /// What makes this camera unusable, if anything: sizes of zero, focal lengths that are not positive and finite,
+    /// What makes this camera unusable, if anything: sizes of zero or beyond reason, focal lengths that are not positive and finite,
     /// other parameters that are not finite.
     pub fn fault(&self) -> Option<String> {
         let coefficients = self
@@ -226,6 +229,11 @@ impl SourceCamera {
         if self.width == 0 || self.height == 0 {
             Some(format!(
                 "has a picture size of {}x{}",
+                self.width, self.height
+            ))
+        } else if u64::from(self.width) * u64::from(self.height) > MOST_PIXELS {
+            Some(format!(
+                "has a picture size of {}x{}, more than can be worked with",
                 self.width, self.height
             ))
         } else if self.fx == 0.0 || self.fy == 0.0 {

@@ -151,6 +151,38 @@ fn counts_beyond_the_file_allocate_nothing() {
 }
 
 #[test]
+fn damaged_bytes_never_panic() {
+    let mut state = 1_u64;
+    let mut random = move |below: usize| {
+        // Knuth's linear congruential generator; the high bits are the good ones.
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as usize % below
+    };
+    for extension in ["bin", "txt"] {
+        let dir = copied("full_opencv", extension);
+        for part in ["cameras", "images", "points3D"] {
+            let path = dir.path().join(format!("sparse/0/{part}.{extension}"));
+            let whole = fs::read(&path).expect("the file");
+            for _ in 0..150 {
+                let mut bytes = whole.clone();
+                for _ in 0..=random(6) {
+                    let at = random(bytes.len());
+                    bytes[at] = random(256) as u8;
+                }
+                fs::write(&path, &bytes).expect("written");
+                let (model, _) = read_all(dir.path());
+                for camera in model.cameras.values().flatten() {
+                    camera.project(DVec2::new(0.3, -0.2));
+                }
+            }
+            fs::write(&path, &whole).expect("written");
+        }
+    }
+}
+
+#[test]
 fn faulty_cameras_are_named_with_their_line() {
     let dir = copied("pinhole", "txt");
     let text = "# comment\n7 PINHOLE 96 70 0 92.5 45.5 37.25\n8 SIMPLE_RADIAL 96 70 nan 45.5 37 0\n\
