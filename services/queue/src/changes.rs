@@ -30,6 +30,8 @@ impl Changes {
 #[derive(Debug)]
 pub(crate) struct Signal {
     generation: watch::Sender<u64>,
+    /// Changes that this process made, to be told to others.
+    own: watch::Sender<u64>,
     poll: Duration,
 }
 
@@ -37,13 +39,20 @@ impl Signal {
     pub(crate) fn new(poll: Duration) -> Self {
         Self {
             generation: watch::Sender::new(0),
+            own: watch::Sender::new(0),
             poll,
         }
     }
 
+    /// After this process changed something.
     pub(crate) fn raise(&self) {
-        self.generation
-            .send_modify(|generation| *generation = generation.wrapping_add(1));
+        bump(&self.own);
+        bump(&self.generation);
+    }
+
+    /// After another process did.
+    pub(crate) fn raise_foreign(&self) {
+        bump(&self.generation);
     }
 
     pub(crate) fn subscribe(&self) -> Changes {
@@ -52,4 +61,12 @@ impl Signal {
             poll: self.poll,
         }
     }
+
+    pub(crate) fn subscribe_own(&self) -> watch::Receiver<u64> {
+        self.own.subscribe()
+    }
+}
+
+fn bump(counter: &watch::Sender<u64>) {
+    counter.send_modify(|count| *count = count.wrapping_add(1));
 }

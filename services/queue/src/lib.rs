@@ -3,10 +3,20 @@
 //! - [`state`]: the rules of a job's life, pure.
 //! - [`store`]: what a queue can do, as a trait with its types and errors.
 //! - [`changes`]: waiting for changes.
+//! - [`postgres`] and [`sqlite`]: the two databases; `sql` is the text they share.
+//!
+//! Invariant: nothing outside the state machine decides what becomes of a job; the stores only find, lock and keep.
+
+use std::sync::Arc;
 
 pub mod changes;
+mod check;
+mod error;
+pub mod postgres;
+pub mod sqlite;
 pub mod state;
 pub mod store;
+mod waiting;
 
 pub use changes::Changes;
 pub use state::{
@@ -16,3 +26,17 @@ pub use store::{
     Collection, JobFilter, JobPage, LogLine, NewLogLine, NewVersion, Orders, Reaped, Settings,
     Status, Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker, WorkerInfo,
 };
+
+/// Opens the store that the URL names (`sqlite:///path/to/file` or `postgres://...`) and brings its schema up to date.
+pub async fn open(url: &str, settings: Settings) -> store::Result<Arc<dyn Store>> {
+    if url.starts_with("sqlite:") {
+        Ok(Arc::new(sqlite::open(url, settings).await?))
+    } else if url.starts_with("postgres:") || url.starts_with("postgresql:") {
+        Ok(Arc::new(postgres::open(url, settings).await?))
+    } else {
+        Err(StoreError::Invalid {
+            field: "database",
+            message: "the URL must start with sqlite: or postgres:".to_owned(),
+        })
+    }
+}

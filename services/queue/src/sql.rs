@@ -1,0 +1,1289 @@
+//! The store's operations in SQL that both dialects speak.
+//!
+//! This file is compiled twice, as a child of `postgres.rs` and of `sqlite.rs`: the parent gives the names in the `use
+//! super` line below (types of the driver, how rows are locked, how times and ids are kept). So an operation is written
+//! once and both stores behave alike; what differs is in the parents.
+//!
+//! Every change of a job is: lock its row, apply the pure transition of [`crate::state`], write it back, commit, signal.
+//! Lock order where one transaction takes several: collection, job, object.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use chrono::{DateTime, Utc};
+use ign_proto::{Attempt, CollectionId, Digest, JobId, ObjectName, WorkerId};
+use sqlx::types::Json;
+use sqlx::{AssertSqlSafe, QueryBuilder, Row, Transaction};
+
+use super::{
+    ALIAS_LIST, Backend, Connection, Db, DbTime, LOCK, LOCK_FREE_ROWS, from_db, from_key, key,
+    push_label, to_db,
+};
+use crate::changes::{Changes, Signal};
+use crate::check;
+use crate::error::from_commit;
+use crate::state::{Checkpoint, Failure, Job, JobSpec, JobState, Level, Progress, Refusal};
+use crate::store::{
+    Collection, JobFilter, JobPage, LogLine, MAX_LOG_LINES, MAX_PAGE, NewLogLine, NewVersion,
+    Orders, Reaped, Result, Settings, Status, Store, StoreError, Submit, Version, VersionFilter,
+    Waiting, Worker, WorkerInfo,
+};
+use crate::waiting::{Rival, Surroundings, describe};
+
+type DbRow = <Db as sqlx::Database>::Row;
+
+/// Rows of one insert; a row has at most a dozen bound values, and SQLite takes 32,766 of them.
+const CHUNK: usize = 500;
+/// A worker's row is written again after this many seconds, so that idle workers cost reads only.
+const WORKER_FRESH_SECS: i64 = 5;
+const WORKER_LISTED_SECS: i64 = 3600;
+const WORKER_KEPT_SECS: i64 = 24 * 3600;
+const REAP_BATCH: usize = 100;
+/// Log lines taken from one call; of more, the last.
+const MAX_LINES_PER_CALL: usize = 2000;
+
+const JOB: &str = "id, collection, object, request_id, capture_digest, recipe_json, priority, labels, max_attempts, \
+    state, attempt, attempt_limit, worker, cancel_requested, progress, failure, checkpoint_digest, checkpoint_bytes, \
+    version, submitted_at, not_before, started_at, finished_at, lease_until";
+
+/// The queue in a database.
+#[derive(Debug)]
+pub struct SqlStore {
+    backend: Backend,
+    signal: Arc<Signal>,
+    settings: Settings,
+}
+
+fn sql(text: String) -> AssertSqlSafe<String> {
+    // Only constants of this file and its parents are formatted in; values are bound.
+    AssertSqlSafe(text)
+}
+
+fn internal(message: impl std::fmt::Display) -> StoreError {
+    StoreError::Internal {
+        message: message.to_string(),
+        source: None,
+    }
+}
+
+fn parse<T: std::str::FromStr>(text: &str) -> Result<T>
+where
+    T::Err: std::fmt::Display,
+{
+    text.parse().map_err(internal)
+}
+
+fn seconds(secs: i64) -> chrono::TimeDelta {
+    chrono::TimeDelta::seconds(secs)
+}
+
+/// A count or size that is never negative.
+fn count(value: i64) -> u64 {
+    value.max(0) as u64
+}
+
+fn small(value: i64) -> Result<u32> {
+    u32::try_from(value).map_err(|_range| internal(format!("{value} is out of range")))
+}
+
+fn time(row: &DbRow, column: &str) -> Result<DateTime<Utc>> {
+    from_db(row.try_get::<DbTime, _>(column)?)
+}
+
+fn optional_time(row: &DbRow, column: &str) -> Result<Option<DateTime<Utc>>> {
+    row.try_get::<Option<DbTime>, _>(column)?
+        .map(from_db)
+        .transpose()
+}
+
+fn object_name(row: &DbRow) -> Result<ObjectName> {
+    Ok(ObjectName {
+        collection: parse(row.try_get("collection")?)?,
+        object: parse(row.try_get("object")?)?,
+    })
+}
+
+fn job_from(row: &DbRow) -> Result<Job> {
+    let checkpoint = match row.try_get::<Option<&str>, _>("checkpoint_digest")? {
+        Some(digest) => Some(Checkpoint {
+            digest: parse(digest)?,
+            size_bytes: count(row.try_get("checkpoint_bytes")?),
+        }),
+        None => None,
+    };
+    Ok(Job {
+        id: from_key(row.try_get("id")?)?,
+        request_id: row.try_get("request_id")?,
+        spec: JobSpec {
+            object: object_name(row)?,
+            capture_digest: parse(row.try_get("capture_digest")?)?,
+            recipe_json: row.try_get("recipe_json")?,
+            priority: i32::try_from(row.try_get::<i64, _>("priority")?).map_err(internal)?,
+            labels: row.try_get::<Json<_>, _>("labels")?.0,
+            max_attempts: small(row.try_get("max_attempts")?)?,
+        },
+        state: parse(row.try_get("state")?)?,
+        attempt: Attempt(small(row.try_get("attempt")?)?),
+        attempt_limit: small(row.try_get("attempt_limit")?)?,
+        worker: row
+            .try_get::<Option<&str>, _>("worker")?
+            .map(parse)
+            .transpose()?,
+        cancel_requested: row.try_get("cancel_requested")?,
+        progress: row
+            .try_get::<Option<Json<Progress>>, _>("progress")?
+            .map(|json| json.0),
+        failure: row
+            .try_get::<Option<Json<Failure>>, _>("failure")?
+            .map(|json| json.0),
+        checkpoint,
+        version: row
+            .try_get::<Option<i64>, _>("version")?
+            .map(small)
+            .transpose()?,
+        submitted_at: time(row, "submitted_at")?,
+        not_before: time(row, "not_before")?,
+        started_at: optional_time(row, "started_at")?,
+        finished_at: optional_time(row, "finished_at")?,
+        lease_until: optional_time(row, "lease_until")?,
+    })
+}
+
+fn jobs_from(rows: &[DbRow]) -> Result<Vec<Job>> {
+    rows.iter().map(job_from).collect()
+}
+
+fn version_from(row: &DbRow) -> Result<Version> {
+    let mut aliases: Vec<String> = match row.try_get::<Option<&str>, _>("aliases")? {
+        Some(list) => list.split(',').map(str::to_owned).collect(),
+        None => Vec::new(),
+    };
+    aliases.sort_unstable();
+    Ok(Version {
+        object: object_name(row)?,
+        version: small(row.try_get("version")?)?,
+        bundle: NewVersion {
+            manifest_digest: parse(row.try_get("manifest_digest")?)?,
+            size_bytes: count(row.try_get("size_bytes")?),
+            file_count: small(row.try_get("file_count")?)?,
+            metrics_json: row.try_get("metrics_json")?,
+        },
+        aliases,
+        created_at: time(row, "created_at")?,
+        job: from_key(row.try_get("job_id")?)?,
+        retired: row.try_get("retired")?,
+    })
+}
+
+fn collection_from(row: &DbRow) -> Result<Collection> {
+    Ok(Collection {
+        name: parse(row.try_get("name")?)?,
+        weight: row.try_get("weight")?,
+        max_running: small(row.try_get("max_running")?)?,
+        paused: row.try_get("paused")?,
+    })
+}
+
+/// The job, its row locked until the transaction ends.
+async fn lock_job(connection: &mut Connection, job: JobId) -> Result<Job> {
+    let row = sqlx::query(sql(format!("select {JOB} from jobs where id = $1 {LOCK}")))
+        .bind(key(job))
+        .fetch_optional(connection)
+        .await?;
+    job_from(&row.ok_or_else(|| StoreError::NotFound {
+        kind: "job",
+        name: job.to_string(),
+    })?)
+}
+
+async fn save_job(connection: &mut Connection, job: &Job) -> Result<()> {
+    sqlx::query(
+        "update jobs set state = $2, attempt = $3, attempt_limit = $4, worker = $5, cancel_requested = $6, \
+         progress = $7, failure = $8, checkpoint_digest = $9, checkpoint_bytes = $10, version = $11, \
+         not_before = $12, started_at = $13, finished_at = $14, lease_until = $15 where id = $1",
+    )
+    .bind(key(job.id))
+    .bind(job.state.as_str())
+    .bind(i64::from(job.attempt.0))
+    .bind(i64::from(job.attempt_limit))
+    .bind(job.worker.as_ref().map(WorkerId::as_str))
+    .bind(job.cancel_requested)
+    .bind(job.progress.as_ref().map(Json))
+    .bind(job.failure.as_ref().map(Json))
+    .bind(job.checkpoint.as_ref().map(|checkpoint| checkpoint.digest.as_str()))
+    .bind(job.checkpoint.as_ref().map(|checkpoint| checkpoint.size_bytes as i64))
+    .bind(job.version.map(i64::from))
+    .bind(to_db(job.not_before))
+    .bind(job.started_at.map(to_db))
+    .bind(job.finished_at.map(to_db))
+    .bind(job.lease_until.map(to_db))
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+fn refused(job: &Job, attempt: Attempt, refusal: Refusal) -> StoreError {
+    match refusal {
+        Refusal::LeaseLost => StoreError::LeaseLost {
+            job: job.id,
+            attempt,
+        },
+        Refusal::NotAllowed(state) => StoreError::NotAllowed {
+            message: format!("job {} is {}", job.id, state.as_str()),
+        },
+        Refusal::NotYet => StoreError::NotAllowed {
+            message: format!("job {} backs off", job.id),
+        },
+    }
+}
+
+/// Adds lines to the log of a job whose row is locked, and lets the oldest go.
+async fn append_logs(
+    connection: &mut Connection,
+    job: JobId,
+    attempt: Attempt,
+    mut lines: Vec<NewLogLine>,
+) -> Result<()> {
+    if lines.is_empty() {
+        return Ok(());
+    }
+    let row =
+        sqlx::query("select log_seq, log_source_attempt, log_source_seq from jobs where id = $1")
+            .bind(key(job))
+            .fetch_one(&mut *connection)
+            .await?;
+    let mut seq: i64 = row.try_get("log_seq")?;
+    let known_attempt: i64 = row.try_get("log_source_attempt")?;
+    let mut taken = if known_attempt == i64::from(attempt.0) {
+        count(row.try_get("log_source_seq")?)
+    } else {
+        0
+    };
+    lines.retain(|line| line.source_seq == 0 || line.source_seq > taken);
+    if lines.is_empty() {
+        return Ok(());
+    }
+    taken = lines
+        .iter()
+        .map(|line| line.source_seq)
+        .fold(taken, u64::max)
+        .min(i64::MAX as u64);
+    lines.drain(..lines.len().saturating_sub(MAX_LINES_PER_CALL));
+    for chunk in lines.chunks(CHUNK) {
+        let mut insert = QueryBuilder::<Db>::new(
+            "insert into job_logs (job_id, seq, at, attempt, level, message) ",
+        );
+        insert.push_values(chunk, |mut row, line| {
+            seq += 1;
+            let line = check::log_line(line.clone());
+            row.push_bind(key(job))
+                .push_bind(seq)
+                .push_bind(to_db(line.at))
+                .push_bind(i64::from(attempt.0))
+                .push_bind(level_word(line.level))
+                .push_bind(line.message);
+        });
+        insert.build().execute(&mut *connection).await?;
+    }
+    sqlx::query("delete from job_logs where job_id = $1 and seq <= $2")
+        .bind(key(job))
+        .bind(seq - MAX_LOG_LINES as i64)
+        .execute(&mut *connection)
+        .await?;
+    sqlx::query(
+        "update jobs set log_seq = $2, log_source_attempt = $3, log_source_seq = $4 where id = $1",
+    )
+    .bind(key(job))
+    .bind(seq)
+    .bind(i64::from(attempt.0))
+    .bind(taken as i64)
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+fn level_word(level: Level) -> &'static str {
+    match level {
+        Level::Info => "info",
+        Level::Warn => "warn",
+        Level::Error => "error",
+    }
+}
+
+fn level_from(word: &str) -> Result<Level> {
+    match word {
+        "info" => Ok(Level::Info),
+        "warn" => Ok(Level::Warn),
+        "error" => Ok(Level::Error),
+        other => Err(internal(format!("unknown level {other:?}"))),
+    }
+}
+
+/// Starts a select of versions; the caller adds the condition.
+fn select_versions() -> QueryBuilder<Db> {
+    QueryBuilder::new(format!(
+        "select v.*, (select {ALIAS_LIST} from aliases a where a.collection = v.collection and a.object = v.object \
+         and a.version = v.version) as aliases from versions v where true"
+    ))
+}
+
+/// The version that a reference names.
+async fn find_version(
+    connection: &mut Connection,
+    object: &ObjectName,
+    reference: &str,
+) -> Result<Version> {
+    let mut query = select_versions();
+    query
+        .push(" and v.collection = ")
+        .push_bind(object.collection.as_str());
+    query
+        .push(" and v.object = ")
+        .push_bind(object.object.as_str());
+    if let Some(version) = check::version_number(reference) {
+        query
+            .push(" and v.version = ")
+            .push_bind(i64::from(version));
+    } else if let Ok(digest) = reference.parse::<Digest>() {
+        query
+            .push(" and v.manifest_digest = ")
+            .push_bind(digest.as_str().to_owned());
+    } else {
+        let alias = if reference.is_empty() {
+            "latest"
+        } else {
+            reference
+        };
+        query
+            .push(
+                " and v.version = (select a.version from aliases a where a.collection = v.collection \
+                 and a.object = v.object and a.alias = ",
+            )
+            .push_bind(alias.to_owned())
+            .push(")");
+    }
+    query.push(" order by v.version desc limit 1");
+    let row = query.build().fetch_optional(connection).await?;
+    let absent = || {
+        let reference = if reference.is_empty() {
+            "latest"
+        } else {
+            reference
+        };
+        StoreError::NotFound {
+            kind: "bundle",
+            name: format!("{object}:{reference}"),
+        }
+    };
+    version_from(&row.ok_or_else(absent)?)
+}
+
+async fn point_alias(
+    connection: &mut Connection,
+    object: &ObjectName,
+    alias: &str,
+    version: u32,
+) -> Result<()> {
+    sqlx::query(
+        "insert into aliases (collection, object, alias, version) values ($1, $2, $3, $4) \
+         on conflict (collection, object, alias) do update set version = excluded.version",
+    )
+    .bind(object.collection.as_str())
+    .bind(object.object.as_str())
+    .bind(alias)
+    .bind(i64::from(version))
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+/// Orders whatever changes the versions and aliases of one object.
+async fn lock_object(connection: &mut Connection, object: &ObjectName) -> Result<()> {
+    sqlx::query(sql(format!(
+        "select last_version from objects where collection = $1 and object = $2 {LOCK}"
+    )))
+    .bind(object.collection.as_str())
+    .bind(object.object.as_str())
+    .fetch_optional(connection)
+    .await?;
+    Ok(())
+}
+
+impl SqlStore {
+    pub(super) fn new(backend: Backend, signal: Arc<Signal>, settings: Settings) -> Self {
+        Self {
+            backend,
+            signal,
+            settings,
+        }
+    }
+
+    async fn begin(&self) -> Result<(Transaction<'static, Db>, DateTime<Utc>)> {
+        let mut transaction = self.backend.begin().await?;
+        let now = Backend::now(&mut transaction).await?;
+        Ok((transaction, now))
+    }
+
+    async fn commit(&self, transaction: Transaction<'static, Db>) -> Result<()> {
+        transaction.commit().await.map_err(from_commit)?;
+        self.signal.raise();
+        Ok(())
+    }
+
+    /// One transition of one job.
+    async fn change<T>(
+        &self,
+        job: JobId,
+        transition: impl FnOnce(&mut Job, DateTime<Utc>) -> std::result::Result<T, Refusal> + Send,
+    ) -> Result<(Job, T)>
+    where
+        T: Send,
+    {
+        let (mut transaction, now) = self.begin().await?;
+        let mut job = lock_job(&mut transaction, job).await?;
+        let attempt = job.attempt;
+        let outcome =
+            transition(&mut job, now).map_err(|refusal| refused(&job, attempt, refusal))?;
+        save_job(&mut transaction, &job).await?;
+        self.commit(transaction).await?;
+        Ok((job, outcome))
+    }
+
+    /// Queues requests that were checked, sorted by their key so that concurrent batches lock in one order.
+    async fn insert_jobs(
+        &self,
+        requests: &[(usize, JobId, Submit)],
+    ) -> Result<Vec<(usize, Result<Job>)>> {
+        let (mut transaction, now) = self.begin().await?;
+        let mut names: Vec<&str> = requests
+            .iter()
+            .map(|(_, _, request)| request.spec.object.collection.as_str())
+            .collect();
+        names.dedup();
+        let mut insert = QueryBuilder::<Db>::new("insert into collections (name) ");
+        insert.push_values(names, |mut row, name| {
+            row.push_bind(name);
+        });
+        insert
+            .push(" on conflict do nothing")
+            .build()
+            .execute(&mut *transaction)
+            .await?;
+
+        let mut insert = QueryBuilder::<Db>::new(
+            "insert into jobs (id, collection, object, request_id, capture_digest, recipe_json, priority, labels, \
+             max_attempts, state, attempt, attempt_limit, cancel_requested, submitted_at, not_before) ",
+        );
+        insert.push_values(requests, |mut row, (_, id, request)| {
+            let job = Job::submit(*id, request.request_id.clone(), request.spec.clone(), now);
+            row.push_bind(key(job.id))
+                .push_bind(job.spec.object.collection.as_str())
+                .push_bind(job.spec.object.object.as_str())
+                .push_bind(job.request_id.as_str())
+                .push_bind(job.spec.capture_digest.as_str())
+                .push_bind(job.spec.recipe_json.as_str())
+                .push_bind(i64::from(job.spec.priority))
+                .push_bind(Json(&job.spec.labels))
+                .push_bind(i64::from(job.spec.max_attempts))
+                .push_bind(job.state.as_str())
+                .push_bind(i64::from(job.attempt.0))
+                .push_bind(i64::from(job.attempt_limit))
+                .push_bind(job.cancel_requested)
+                .push_bind(to_db(job.submitted_at))
+                .push_bind(to_db(job.not_before));
+        });
+        insert
+            .push(" on conflict (collection, request_id) do nothing")
+            .build()
+            .execute(&mut *transaction)
+            .await?;
+
+        let mut select = QueryBuilder::<Db>::new(format!(
+            "select {JOB} from jobs where (collection, request_id) in ("
+        ));
+        select.push_values(requests, |mut row, (_, _, request)| {
+            row.push_bind(request.spec.object.collection.as_str())
+                .push_bind(request.request_id.as_str());
+        });
+        let rows = select
+            .push(")")
+            .build()
+            .fetch_all(&mut *transaction)
+            .await?;
+        self.commit(transaction).await?;
+
+        let mut jobs = BTreeMap::new();
+        for job in jobs_from(&rows)? {
+            jobs.insert(
+                (job.spec.object.collection.clone(), job.request_id.clone()),
+                job,
+            );
+        }
+        let outcome = |request: &Submit| {
+            let at = (
+                request.spec.object.collection.clone(),
+                request.request_id.clone(),
+            );
+            match jobs.get(&at) {
+                Some(job) if job.spec == request.spec => Ok(job.clone()),
+                Some(_) => Err(StoreError::Conflict {
+                    key: request.request_id.clone(),
+                }),
+                None => Err(internal("a job vanished while it was submitted")),
+            }
+        };
+        Ok(requests
+            .iter()
+            .map(|(index, _, request)| (*index, outcome(request)))
+            .collect())
+    }
+
+    /// Notes that a worker is there; answers whether it drains.
+    async fn touch_worker(&self, worker: &WorkerInfo) -> Result<bool> {
+        let worker = check::worker(worker);
+        let mut reader = self.backend.reader().acquire().await?;
+        let now = Backend::now(&mut reader).await?;
+        let known = sqlx::query(
+            "select hostname, version, device, last_seen_at, draining from workers where id = $1",
+        )
+        .bind(worker.id.as_str())
+        .fetch_optional(&mut *reader)
+        .await?;
+        drop(reader);
+        if let Some(row) = known {
+            let same = row.try_get::<&str, _>("hostname")? == worker.hostname
+                && row.try_get::<&str, _>("version")? == worker.version
+                && row.try_get::<&str, _>("device")? == worker.device;
+            if same && time(&row, "last_seen_at")? + seconds(WORKER_FRESH_SECS) > now {
+                return Ok(row.try_get("draining")?);
+            }
+        }
+        let mut transaction = self.backend.begin().await?;
+        let row = sqlx::query(
+            "insert into workers (id, hostname, version, device, last_seen_at) values ($1, $2, $3, $4, $5) \
+             on conflict (id) do update set hostname = excluded.hostname, version = excluded.version, \
+             device = excluded.device, last_seen_at = excluded.last_seen_at returning draining",
+        )
+        .bind(worker.id.as_str())
+        .bind(worker.hostname)
+        .bind(worker.version)
+        .bind(worker.device)
+        .bind(to_db(now))
+        .fetch_one(&mut *transaction)
+        .await?;
+        transaction.commit().await.map_err(from_commit)?;
+        Ok(row.try_get("draining")?)
+    }
+
+    /// Collections with something to lease, in the order in which they are served.
+    async fn eligible(&self) -> Result<Vec<CollectionId>> {
+        let mut reader = self.backend.reader().acquire().await?;
+        let now = Backend::now(&mut reader).await?;
+        let rows = sqlx::query(
+            "select c.name from collections c \
+             left join (select collection, count(*) as running from jobs where state = 'leased' group by collection) r \
+             on r.collection = c.name \
+             join jobs j on j.id = (select q.id from jobs q where q.collection = c.name and q.state = 'queued' \
+             and q.not_before <= $1 order by q.priority desc, q.submitted_at, q.id limit 1) \
+             where not c.paused and (c.max_running = 0 or coalesce(r.running, 0) < c.max_running) \
+             order by j.priority desc, coalesce(r.running, 0) / c.weight, \
+             (select max(s.started_at) from jobs s where s.collection = c.name and s.started_at is not null) \
+             nulls first, j.submitted_at, j.id",
+        )
+        .bind(to_db(now))
+        .fetch_all(&mut *reader)
+        .await?;
+        rows.iter().map(|row| parse(row.try_get("name")?)).collect()
+    }
+
+    /// Leases the first job of a collection that nobody else is about to take.
+    async fn claim(
+        &self,
+        connection: &mut Connection,
+        collection: &CollectionId,
+        worker: &WorkerId,
+        now: DateTime<Utc>,
+    ) -> Result<Option<Job>> {
+        if !has_room(connection, collection).await? {
+            return Ok(None);
+        }
+        let row = sqlx::query(sql(format!(
+            "select {JOB} from jobs where collection = $1 and state = 'queued' and not_before <= $2 \
+             order by priority desc, submitted_at, id limit 1 {LOCK_FREE_ROWS}"
+        )))
+        .bind(collection.as_str())
+        .bind(to_db(now))
+        .fetch_optional(&mut *connection)
+        .await?;
+        let Some(row) = row else { return Ok(None) };
+        let mut job = job_from(&row)?;
+        let attempt = job.attempt;
+        job.lease(worker.clone(), now, self.settings.lease)
+            .map_err(|refusal| refused(&job, attempt, refusal))?;
+        save_job(connection, &job).await?;
+        Ok(Some(job))
+    }
+}
+
+/// Whether the collection may run one more job. Where it has a limit its row is locked, so that two claims do not both
+/// take the last place; others are not held up.
+async fn has_room(connection: &mut Connection, collection: &CollectionId) -> Result<bool> {
+    let row = sqlx::query("select * from collections where name = $1")
+        .bind(collection.as_str())
+        .fetch_one(&mut *connection)
+        .await?;
+    let settings = collection_from(&row)?;
+    if settings.paused || settings.max_running == 0 {
+        return Ok(!settings.paused);
+    }
+    let row = sqlx::query(sql(format!(
+        "select * from collections where name = $1 {LOCK}"
+    )))
+    .bind(collection.as_str())
+    .fetch_one(&mut *connection)
+    .await?;
+    let settings = collection_from(&row)?;
+    let running: i64 =
+        sqlx::query_scalar("select count(*) from jobs where collection = $1 and state = 'leased'")
+            .bind(collection.as_str())
+            .fetch_one(connection)
+            .await?;
+    Ok(!settings.paused
+        && (settings.max_running == 0 || count(running) < u64::from(settings.max_running)))
+}
+
+fn select_jobs(collection: Option<&CollectionId>, state: JobState) -> QueryBuilder<Db> {
+    let mut query = QueryBuilder::new(format!(
+        "select {JOB} from jobs where state = '{}'",
+        state.as_str()
+    ));
+    if let Some(collection) = collection {
+        query
+            .push(" and collection = ")
+            .push_bind(collection.as_str().to_owned());
+    }
+    query
+}
+
+async fn list_workers(connection: &mut Connection, now: DateTime<Utc>) -> Result<Vec<Worker>> {
+    let rows = sqlx::query(
+        "select w.*, (select j.id from jobs j where j.worker = w.id and j.state = 'leased' \
+         order by j.started_at desc limit 1) as job_id from workers w where w.last_seen_at > $1 order by w.id",
+    )
+    .bind(to_db(now - seconds(WORKER_LISTED_SECS)))
+    .fetch_all(connection)
+    .await?;
+    rows.iter()
+        .map(|row| {
+            Ok(Worker {
+                info: WorkerInfo {
+                    id: parse(row.try_get("id")?)?,
+                    hostname: row.try_get("hostname")?,
+                    version: row.try_get("version")?,
+                    device: row.try_get("device")?,
+                },
+                last_seen_at: time(row, "last_seen_at")?,
+                job: row
+                    .try_get::<Option<_>, _>("job_id")?
+                    .map(from_key)
+                    .transpose()?,
+                draining: row.try_get("draining")?,
+            })
+        })
+        .collect()
+}
+
+#[async_trait]
+impl Store for SqlStore {
+    fn settings(&self) -> Settings {
+        self.settings
+    }
+
+    fn changes(&self) -> Changes {
+        self.signal.subscribe()
+    }
+
+    async fn ping(&self) -> Result<()> {
+        sqlx::query("select 1")
+            .execute(self.backend.reader())
+            .await?;
+        Ok(())
+    }
+
+    async fn submit_batch(&self, requests: Vec<Submit>) -> Result<Vec<Result<Job>>> {
+        let mut results: Vec<Option<Result<Job>>> = Vec::new();
+        let mut accepted = Vec::new();
+        for (index, request) in requests.into_iter().enumerate() {
+            match check::submit(request) {
+                Ok(request) => {
+                    accepted.push((index, JobId::generate(), request));
+                    results.push(None);
+                }
+                Err(error) => results.push(Some(Err(error))),
+            }
+        }
+        accepted.sort_by(|(_, _, a), (_, _, b)| {
+            (&a.spec.object.collection, &a.request_id)
+                .cmp(&(&b.spec.object.collection, &b.request_id))
+        });
+        for (done, chunk) in accepted.chunks(CHUNK).enumerate() {
+            match self.insert_jobs(chunk).await {
+                Ok(inserted) => {
+                    for (index, result) in inserted {
+                        results[index] = Some(result);
+                    }
+                }
+                Err(StoreError::Unavailable {
+                    source,
+                    determinate,
+                }) => {
+                    return Err(StoreError::Unavailable {
+                        source,
+                        determinate: determinate && done == 0,
+                    });
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        let unanswered = || Err(internal("a submit was not answered"));
+        Ok(results
+            .into_iter()
+            .map(|result| result.unwrap_or_else(unanswered))
+            .collect())
+    }
+
+    async fn get(&self, job: JobId) -> Result<Job> {
+        let row = sqlx::query(sql(format!("select {JOB} from jobs where id = $1")))
+            .bind(key(job))
+            .fetch_optional(self.backend.reader())
+            .await?;
+        job_from(&row.ok_or_else(|| StoreError::NotFound {
+            kind: "job",
+            name: job.to_string(),
+        })?)
+    }
+
+    async fn find(&self, prefix: &str) -> Result<Job> {
+        let (first, last) = check::id_range(prefix)?;
+        let rows = sqlx::query(sql(format!(
+            "select {JOB} from jobs where id >= $1 and id <= $2 limit 2"
+        )))
+        .bind(key(first.into()))
+        .bind(key(last.into()))
+        .fetch_all(self.backend.reader())
+        .await?;
+        match &rows[..] {
+            [] => Err(StoreError::NotFound {
+                kind: "job",
+                name: prefix.to_owned(),
+            }),
+            [row] => job_from(row),
+            _ => Err(StoreError::Invalid {
+                field: "job_id",
+                message: format!("several jobs start with {prefix}; give more of the id"),
+            }),
+        }
+    }
+
+    async fn list(&self, filter: &JobFilter, after: Option<JobId>, limit: u32) -> Result<JobPage> {
+        let limit = limit.clamp(1, MAX_PAGE) as usize;
+        let mut query = QueryBuilder::<Db>::new(format!("select {JOB} from jobs where true"));
+        if let Some(collection) = &filter.collection {
+            query
+                .push(" and collection = ")
+                .push_bind(collection.as_str());
+        }
+        if let Some(object) = &filter.object {
+            query.push(" and object = ").push_bind(object.as_str());
+        }
+        if !filter.states.is_empty() {
+            let words: Vec<String> = filter
+                .states
+                .iter()
+                .map(|state| format!("'{}'", state.as_str()))
+                .collect();
+            query.push(format!(" and state in ({})", words.join(", ")));
+        }
+        for (label, value) in &filter.labels {
+            query.push(" and ");
+            push_label(&mut query, label, value);
+        }
+        if let Some(after) = after {
+            query.push(" and id < ").push_bind(key(after));
+        }
+        query
+            .push(" order by id desc limit ")
+            .push_bind(limit as i64 + 1);
+        let mut jobs = jobs_from(&query.build().fetch_all(self.backend.reader()).await?)?;
+        let more = jobs.len() > limit;
+        jobs.truncate(limit);
+        let next = if more {
+            jobs.last().map(|job| job.id)
+        } else {
+            None
+        };
+        Ok(JobPage { jobs, next })
+    }
+
+    async fn waiting(&self, job: &Job) -> Result<Waiting> {
+        if job.state != JobState::Queued {
+            return Ok(Waiting {
+                position: 0,
+                reason: String::new(),
+            });
+        }
+        let name = &job.spec.object.collection;
+        let mut reader = self.backend.reader().acquire().await?;
+        let now = Backend::now(&mut reader).await?;
+        let row = sqlx::query(
+            "select c.*, (select count(*) from jobs j where j.collection = c.name and j.state = 'leased') as running, \
+             (select count(*) from jobs j where j.collection = c.name and j.state = 'queued' and (j.priority > $2 \
+             or (j.priority = $2 and (j.submitted_at, j.id) < ($3, $4)))) as ahead, \
+             (select count(*) from workers w where not w.draining and w.last_seen_at > $5) as workers \
+             from collections c where c.name = $1",
+        )
+        .bind(name.as_str())
+        .bind(i64::from(job.spec.priority))
+        .bind(to_db(job.submitted_at))
+        .bind(key(job.id))
+        .bind(to_db(now - self.settings.lease))
+        .fetch_one(&mut *reader)
+        .await?;
+        let rivals = sqlx::query(
+            "select c.weight, q.higher, q.equal from collections c join (select collection, \
+             sum(case when priority > $2 then 1 else 0 end) as higher, \
+             sum(case when priority = $2 then 1 else 0 end) as equal \
+             from jobs where state = 'queued' group by collection) q on q.collection = c.name \
+             where c.name <> $1 and not c.paused",
+        )
+        .bind(name.as_str())
+        .bind(i64::from(job.spec.priority))
+        .fetch_all(&mut *reader)
+        .await?;
+        let others = rivals
+            .iter()
+            .map(|row| {
+                Ok(Rival {
+                    weight: row.try_get("weight")?,
+                    higher: count(row.try_get("higher")?),
+                    equal: count(row.try_get("equal")?),
+                })
+            })
+            .collect::<Result<_>>()?;
+        let around = Surroundings {
+            collection: collection_from(&row)?,
+            running: count(row.try_get("running")?),
+            ahead: count(row.try_get("ahead")?),
+            others,
+            workers: count(row.try_get("workers")?),
+            now,
+        };
+        Ok(describe(job, &around))
+    }
+
+    async fn cancel(&self, job: JobId) -> Result<Job> {
+        let cancel = |job: &mut Job, now| {
+            job.cancel(now);
+            Ok(())
+        };
+        Ok(self.change(job, cancel).await?.0)
+    }
+
+    async fn retry(&self, job: JobId) -> Result<Job> {
+        Ok(self.change(job, Job::retry).await?.0)
+    }
+
+    async fn logs(&self, job: JobId, after_seq: u64, limit: u32) -> Result<Vec<LogLine>> {
+        let rows = sqlx::query(
+            "select seq, at, attempt, level, message from job_logs where job_id = $1 and seq > $2 order by seq limit $3",
+        )
+        .bind(key(job))
+        .bind(i64::try_from(after_seq).unwrap_or(i64::MAX))
+        .bind(i64::from(limit.clamp(1, MAX_PAGE)))
+        .fetch_all(self.backend.reader())
+        .await?;
+        if rows.is_empty() {
+            // Tells an unknown job from a silent one.
+            self.get(job).await?;
+        }
+        rows.iter()
+            .map(|row| {
+                Ok(LogLine {
+                    seq: count(row.try_get("seq")?),
+                    at: time(row, "at")?,
+                    attempt: Attempt(small(row.try_get("attempt")?)?),
+                    level: level_from(row.try_get("level")?)?,
+                    message: row.try_get("message")?,
+                })
+            })
+            .collect()
+    }
+
+    async fn status(&self, collection: Option<&CollectionId>, limit: u32) -> Result<Status> {
+        let limit = i64::from(limit.min(MAX_PAGE));
+        let mut reader = self.backend.reader().acquire().await?;
+        let now = Backend::now(&mut reader).await?;
+        let mut counts: BTreeMap<JobState, u64> =
+            JobState::ALL.into_iter().map(|state| (state, 0)).collect();
+        let mut query = QueryBuilder::<Db>::new("select state, count(*) as jobs from jobs");
+        if let Some(collection) = collection {
+            query
+                .push(" where collection = ")
+                .push_bind(collection.as_str());
+        }
+        for row in query
+            .push(" group by state")
+            .build()
+            .fetch_all(&mut *reader)
+            .await?
+        {
+            counts.insert(parse(row.try_get("state")?)?, count(row.try_get("jobs")?));
+        }
+        let mut some = async |state, order| {
+            let mut query = select_jobs(collection, state);
+            query
+                .push(" order by ")
+                .push(order)
+                .push(" limit ")
+                .push_bind(limit);
+            jobs_from(&query.build().fetch_all(&mut *reader).await?)
+        };
+        let running = some(JobState::Leased, "started_at, id").await?;
+        let recent_failures = some(JobState::Failed, "finished_at desc, id").await?;
+        let next_queued = some(JobState::Queued, "priority desc, submitted_at, id").await?;
+        let workers = list_workers(&mut reader, now).await?;
+        Ok(Status {
+            counts,
+            workers,
+            running,
+            recent_failures,
+            next_queued,
+            at: now,
+        })
+    }
+
+    async fn lease(&self, worker: &WorkerInfo) -> Result<Option<Job>> {
+        if self.touch_worker(worker).await? {
+            return Ok(None);
+        }
+        let collections = self.eligible().await?;
+        if collections.is_empty() {
+            return Ok(None);
+        }
+        let (mut transaction, now) = self.begin().await?;
+        for collection in &collections {
+            if let Some(job) = self
+                .claim(&mut transaction, collection, &worker.id, now)
+                .await?
+            {
+                self.commit(transaction).await?;
+                return Ok(Some(job));
+            }
+        }
+        Ok(None)
+    }
+
+    async fn heartbeat(
+        &self,
+        job: JobId,
+        attempt: Attempt,
+        progress: Option<Progress>,
+        logs: Vec<NewLogLine>,
+    ) -> Result<Orders> {
+        let (mut transaction, now) = self.begin().await?;
+        let mut job = lock_job(&mut transaction, job).await?;
+        let cancel = job
+            .heartbeat(
+                attempt,
+                progress.map(check::progress),
+                now,
+                self.settings.lease,
+            )
+            .map_err(|refusal| refused(&job, attempt, refusal))?;
+        save_job(&mut transaction, &job).await?;
+        append_logs(&mut transaction, job.id, attempt, logs).await?;
+        let drain: Option<bool> = sqlx::query_scalar(
+            "update workers set last_seen_at = $2 where id = $1 returning draining",
+        )
+        .bind(job.worker.as_ref().map(WorkerId::as_str))
+        .bind(to_db(now))
+        .fetch_optional(&mut *transaction)
+        .await?;
+        self.commit(transaction).await?;
+        Ok(Orders {
+            cancel,
+            drain: drain.unwrap_or(false),
+        })
+    }
+
+    async fn checkpoint(&self, job: JobId, attempt: Attempt, checkpoint: Checkpoint) -> Result<()> {
+        check::bytes("size_bytes", checkpoint.size_bytes)?;
+        let (mut transaction, _now) = self.begin().await?;
+        let mut job = lock_job(&mut transaction, job).await?;
+        job.checkpointed(attempt, checkpoint)
+            .map_err(|refusal| refused(&job, attempt, refusal))?;
+        save_job(&mut transaction, &job).await?;
+        self.commit(transaction).await
+    }
+
+    async fn publish_and_complete(
+        &self,
+        job: JobId,
+        attempt: Attempt,
+        bundle: NewVersion,
+    ) -> Result<Version> {
+        check::bundle(&bundle)?;
+        let (mut transaction, now) = self.begin().await?;
+        let mut job = lock_job(&mut transaction, job).await?;
+        let object = job.spec.object.clone();
+        if let (Some(version), true) = (job.version, job.attempt == attempt) {
+            let published = find_version(&mut transaction, &object, &format!("v{version}")).await?;
+            if published.bundle.manifest_digest == bundle.manifest_digest {
+                return Ok(published);
+            }
+        }
+        job.holds(attempt)
+            .map_err(|refusal| refused(&job, attempt, refusal))?;
+
+        let version: i64 = sqlx::query_scalar(
+            "insert into objects (collection, object, last_version) values ($1, $2, 1) \
+             on conflict (collection, object) do update set last_version = objects.last_version + 1 \
+             returning last_version",
+        )
+        .bind(object.collection.as_str())
+        .bind(object.object.as_str())
+        .fetch_one(&mut *transaction)
+        .await?;
+        let version = small(version)?;
+        sqlx::query(
+            "insert into versions (collection, object, version, manifest_digest, size_bytes, file_count, \
+             metrics_json, job_id, created_at) values ($1, $2, $3, $4, $5, $6, $7, $8, $9)",
+        )
+        .bind(object.collection.as_str())
+        .bind(object.object.as_str())
+        .bind(i64::from(version))
+        .bind(bundle.manifest_digest.as_str())
+        .bind(bundle.size_bytes as i64)
+        .bind(i64::from(bundle.file_count))
+        .bind(&bundle.metrics_json)
+        .bind(key(job.id))
+        .bind(to_db(now))
+        .execute(&mut *transaction)
+        .await?;
+        point_alias(&mut transaction, &object, "latest", version).await?;
+        job.complete(attempt, version, now)
+            .map_err(|refusal| refused(&job, attempt, refusal))?;
+        save_job(&mut transaction, &job).await?;
+        let published = find_version(&mut transaction, &object, &format!("v{version}")).await?;
+        self.commit(transaction).await?;
+        Ok(published)
+    }
+
+    async fn fail(
+        &self,
+        job: JobId,
+        attempt: Attempt,
+        failure: Failure,
+        logs: Vec<NewLogLine>,
+    ) -> Result<bool> {
+        let (mut transaction, now) = self.begin().await?;
+        let mut job = lock_job(&mut transaction, job).await?;
+        let will_retry = job
+            .fail(
+                attempt,
+                check::failure(&failure),
+                now,
+                &self.settings.backoff,
+            )
+            .map_err(|refusal| refused(&job, attempt, refusal))?;
+        save_job(&mut transaction, &job).await?;
+        append_logs(&mut transaction, job.id, attempt, logs).await?;
+        self.commit(transaction).await?;
+        Ok(will_retry)
+    }
+
+    async fn reap(&self) -> Result<Reaped> {
+        let mut reaped = Reaped::default();
+        loop {
+            let (mut transaction, now) = self.begin().await?;
+            let rows = sqlx::query(sql(format!(
+                "select {JOB} from jobs where state = 'leased' and lease_until <= $1 order by lease_until \
+                 limit {REAP_BATCH} {LOCK_FREE_ROWS}"
+            )))
+            .bind(to_db(now))
+            .fetch_all(&mut *transaction)
+            .await?;
+            for mut job in jobs_from(&rows)? {
+                if job.expire(now) {
+                    save_job(&mut transaction, &job).await?;
+                    let list = if job.state == JobState::Queued {
+                        &mut reaped.requeued
+                    } else {
+                        &mut reaped.ended
+                    };
+                    list.push(job.id);
+                }
+            }
+            if rows.len() < REAP_BATCH {
+                sqlx::query("delete from workers where last_seen_at < $1")
+                    .bind(to_db(now - seconds(WORKER_KEPT_SECS)))
+                    .execute(&mut *transaction)
+                    .await?;
+            }
+            if rows.is_empty() {
+                // Nothing for others to see.
+                transaction.commit().await.map_err(from_commit)?;
+            } else {
+                self.commit(transaction).await?;
+            }
+            if rows.len() < REAP_BATCH {
+                return Ok(reaped);
+            }
+        }
+    }
+
+    async fn workers(&self) -> Result<Vec<Worker>> {
+        let mut reader = self.backend.reader().acquire().await?;
+        let now = Backend::now(&mut reader).await?;
+        list_workers(&mut reader, now).await
+    }
+
+    async fn drain_worker(&self, worker: &WorkerId, draining: bool) -> Result<()> {
+        let (mut transaction, _now) = self.begin().await?;
+        let done = sqlx::query("update workers set draining = $2 where id = $1")
+            .bind(worker.as_str())
+            .bind(draining)
+            .execute(&mut *transaction)
+            .await?;
+        if done.rows_affected() == 0 {
+            return Err(StoreError::NotFound {
+                kind: "worker",
+                name: worker.to_string(),
+            });
+        }
+        self.commit(transaction).await
+    }
+
+    async fn versions(&self, filter: &VersionFilter) -> Result<Vec<Version>> {
+        let mut query = select_versions();
+        if let Some(collection) = &filter.collection {
+            query
+                .push(" and v.collection = ")
+                .push_bind(collection.as_str());
+        }
+        if let Some(object) = &filter.object {
+            query.push(" and v.object = ").push_bind(object.as_str());
+        }
+        if !filter.include_retired {
+            query.push(" and not v.retired");
+        }
+        let rows = query.build().fetch_all(self.backend.reader()).await?;
+        let mut versions = rows.iter().map(version_from).collect::<Result<Vec<_>>>()?;
+        // Here and not in SQL: the order of text there depends on the database's locale.
+        versions.sort_by(|a, b| (&a.object, a.version).cmp(&(&b.object, b.version)));
+        Ok(versions)
+    }
+
+    async fn version(&self, object: &ObjectName, reference: &str) -> Result<Version> {
+        let mut reader = self.backend.reader().acquire().await?;
+        find_version(&mut reader, object, reference).await
+    }
+
+    async fn set_alias(
+        &self,
+        object: &ObjectName,
+        reference: &str,
+        alias: &str,
+    ) -> Result<Version> {
+        check::alias(alias)?;
+        let (mut transaction, _now) = self.begin().await?;
+        lock_object(&mut transaction, object).await?;
+        let version = find_version(&mut transaction, object, reference).await?;
+        if version.retired {
+            return Err(StoreError::NotAllowed {
+                message: format!("{object}:v{} is retired", version.version),
+            });
+        }
+        point_alias(&mut transaction, object, alias, version.version).await?;
+        let version = find_version(&mut transaction, object, alias).await?;
+        self.commit(transaction).await?;
+        Ok(version)
+    }
+
+    async fn retire(&self, object: &ObjectName, reference: &str) -> Result<Version> {
+        let (mut transaction, _now) = self.begin().await?;
+        lock_object(&mut transaction, object).await?;
+        let version = find_version(&mut transaction, object, reference).await?;
+        if let Some(alias) = version.aliases.iter().find(|alias| *alias != "latest") {
+            return Err(StoreError::NotAllowed {
+                message: format!(
+                    "alias {alias} points to {object}:v{}; move it first",
+                    version.version
+                ),
+            });
+        }
+        sqlx::query("update versions set retired = $4 where collection = $1 and object = $2 and version = $3")
+            .bind(object.collection.as_str())
+            .bind(object.object.as_str())
+            .bind(i64::from(version.version))
+            .bind(true)
+            .execute(&mut *transaction)
+            .await?;
+        if !version.aliases.is_empty() {
+            let newest: Option<i64> = sqlx::query_scalar(
+                "select max(version) from versions where collection = $1 and object = $2 and not retired",
+            )
+            .bind(object.collection.as_str())
+            .bind(object.object.as_str())
+            .fetch_one(&mut *transaction)
+            .await?;
+            match newest {
+                Some(newest) => {
+                    point_alias(&mut transaction, object, "latest", small(newest)?).await?
+                }
+                None => {
+                    sqlx::query("delete from aliases where collection = $1 and object = $2 and alias = 'latest'")
+                        .bind(object.collection.as_str())
+                        .bind(object.object.as_str())
+                        .execute(&mut *transaction)
+                        .await?;
+                }
+            }
+        }
+        let version =
+            find_version(&mut transaction, object, &format!("v{}", version.version)).await?;
+        self.commit(transaction).await?;
+        Ok(version)
+    }
+
+    async fn collections(&self) -> Result<Vec<Collection>> {
+        let rows = sqlx::query("select * from collections")
+            .fetch_all(self.backend.reader())
+            .await?;
+        let mut collections = rows
+            .iter()
+            .map(collection_from)
+            .collect::<Result<Vec<_>>>()?;
+        collections.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(collections)
+    }
+
+    async fn set_collection(&self, collection: Collection) -> Result<Collection> {
+        check::collection(&collection)?;
+        let (mut transaction, _now) = self.begin().await?;
+        sqlx::query(
+            "insert into collections (name, weight, max_running, paused) values ($1, $2, $3, $4) \
+             on conflict (name) do update set weight = excluded.weight, max_running = excluded.max_running, \
+             paused = excluded.paused",
+        )
+        .bind(collection.name.as_str())
+        .bind(collection.weight)
+        .bind(i64::from(collection.max_running))
+        .bind(collection.paused)
+        .execute(&mut *transaction)
+        .await?;
+        self.commit(transaction).await?;
+        Ok(collection)
+    }
+}
