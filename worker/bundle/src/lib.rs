@@ -31,6 +31,8 @@ pub const MANIFEST_FILE: &str = "bundle.json";
 pub const PROXY_FILE: &str = "proxy.glb";
 /// Name of the list of reference views inside a bundle.
 pub const VIEWS_FILE: &str = "references/views.json";
+/// Name of the held-out views' cameras inside a bundle.
+pub const HELD_OUT_VIEWS_FILE: &str = "held_out/views.json";
 /// Name of the metrics inside a bundle.
 pub const METRICS_FILE: &str = "metrics.json";
 /// Name of the report inside a bundle.

@@ -9,17 +9,18 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use ign_geometry::{Mesh, Similarity};
+use ign_geometry::{Camera, Mesh, Similarity};
 use image::{ExtendedColorType, ImageEncoder, RgbImage, codecs::png::PngEncoder};
 use sha2::{Digest, Sha256};
 use walkdir::WalkDir;
 
 use crate::manifest::{FileRecord, Manifest, NetworkDescription, SCHEMA};
 use crate::paths::{held_out_file, inside};
-use crate::references::{self, Reference};
+use crate::references::{self, HeldOutViews, Reference};
 use crate::weights::{self, Precision, Tensors};
 use crate::{
-    BundleError, MANIFEST_FILE, METRICS_FILE, Metrics, PROXY_FILE, REPORT_FILE, VIEWS_FILE, proxy,
+    BundleError, HELD_OUT_VIEWS_FILE, MANIFEST_FILE, METRICS_FILE, Metrics, PROXY_FILE,
+    REPORT_FILE, VIEWS_FILE, proxy,
 };
 
 /// Largest `bundle.json` or `views.json` that is read.
@@ -101,6 +102,13 @@ impl BundleWriter {
     pub fn held_out(&self, view: &str, kind: &str, image: &RgbImage) -> Result<(), BundleError> {
         let path = held_out_file(view, kind);
         self.file(&path, &encode_png(&path, image)?)
+    }
+
+    /// Adds `held_out/views.json`: the normalised frame's camera of each scored image, by the photograph's name.
+    pub fn held_out_cameras(&self, cameras: &[(String, Camera)]) -> Result<(), BundleError> {
+        let json = serde_json::to_vec_pretty(&HeldOutViews::new(cameras))
+            .map_err(BundleError::json(HELD_OUT_VIEWS_FILE))?;
+        self.file(HELD_OUT_VIEWS_FILE, &json)
     }
 
     /// Lists every file with its digest in `manifest`, writes `bundle.json`, and verifies the whole.
@@ -235,16 +243,30 @@ impl Bundle {
 
     /// `metrics.json`, where the bundle has one.
     pub fn metrics(&self) -> Result<Option<Metrics>, BundleError> {
-        if self.manifest.files.iter().any(|f| f.path == METRICS_FILE) {
+        if self.lists(METRICS_FILE) {
             Metrics::from_json(&self.read(METRICS_FILE)?).map(Some)
         } else {
             Ok(None)
         }
     }
 
+    /// The cameras of the scored images in the normalised frame, by name; none in a bundle without them.
+    pub fn held_out_cameras(&self) -> Result<Vec<(String, Camera)>, BundleError> {
+        if !self.lists(HELD_OUT_VIEWS_FILE) {
+            return Ok(Vec::new());
+        }
+        serde_json::from_slice::<HeldOutViews>(&self.read(HELD_OUT_VIEWS_FILE)?)
+            .map_err(BundleError::json(HELD_OUT_VIEWS_FILE))?
+            .cameras()
+    }
+
+    fn lists(&self, path: &str) -> bool {
+        self.manifest.files.iter().any(|f| f.path == path)
+    }
+
     /// The content of a listed file.
     pub fn read(&self, path: &str) -> Result<Vec<u8>, BundleError> {
-        if !self.manifest.files.iter().any(|f| f.path == path) {
+        if !self.lists(path) {
             return Err(BundleError::Missing {
                 file: path.to_owned(),
             });
@@ -275,6 +297,7 @@ impl Bundle {
         if self.references()?.is_empty() {
             return Err(BundleError::malformed(VIEWS_FILE, "no reference views"));
         }
+        self.held_out_cameras()?;
         self.metrics().map(drop)
     }
 }

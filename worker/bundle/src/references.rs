@@ -75,6 +75,51 @@ pub struct ViewRecord {
     pub exposure_gain: [f32; 3],
 }
 
+/// `held_out/views.json`: the cameras of the scored images, so that anyone can render and score them again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct HeldOutViews {
+    /// In the order of `metrics.json`.
+    pub views: Vec<HeldOutRecord>,
+}
+
+/// One entry of [`HeldOutViews`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct HeldOutRecord {
+    /// The photograph's name.
+    pub name: String,
+    /// Of the scored image.
+    pub intrinsics: CameraIntrinsics,
+    /// 3 by 4, row-major; normalised frame, x right, y down, z forward.
+    pub camera_from_world: [f64; 12],
+}
+
+impl HeldOutViews {
+    pub(crate) fn new(cameras: &[(String, Camera)]) -> Self {
+        let record = |(name, camera): &(String, Camera)| HeldOutRecord {
+            name: name.clone(),
+            intrinsics: camera.intrinsics,
+            camera_from_world: to_rows(&camera.camera_from_world),
+        };
+        Self {
+            views: cameras.iter().map(record).collect(),
+        }
+    }
+
+    pub(crate) fn cameras(self) -> Result<Vec<(String, Camera)>, BundleError> {
+        let camera = |record: HeldOutRecord| {
+            let camera = Camera::new(record.intrinsics, from_rows(&record.camera_from_world))
+                .map_err(|source| {
+                    BundleError::malformed(
+                        crate::HELD_OUT_VIEWS_FILE,
+                        format!("view {:?}: {source}", record.name),
+                    )
+                })?;
+            Ok((record.name, camera))
+        };
+        self.views.into_iter().map(camera).collect()
+    }
+}
+
 /// Where reference number `index` lies in a bundle.
 pub fn image_file(index: usize) -> String {
     format!("references/{index:04}.png")

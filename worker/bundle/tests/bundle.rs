@@ -189,6 +189,9 @@ fn write_bundle(dir: &Path) -> Bundle {
     writer
         .held_out("walk/0007.jpg", "ours", &RgbImage::new(12, 12))
         .unwrap();
+    writer
+        .held_out_cameras(&[("walk/0007.jpg".into(), reference(7).camera)])
+        .unwrap();
     writer.report("<!doctype html>").unwrap();
     writer.finish(manifest()).unwrap()
 }
@@ -209,6 +212,10 @@ fn everything_comes_back() {
     assert_eq!(bundle.metrics().unwrap(), Some(metrics()));
     let network = bundle.manifest().networks.composition.clone().unwrap();
     assert_eq!(bundle.weights(&network).unwrap(), weights());
+    assert_eq!(
+        bundle.held_out_cameras().unwrap(),
+        [("walk/0007.jpg".to_owned(), reference(7).camera)]
+    );
     let paths: Vec<_> = bundle
         .manifest()
         .files
@@ -219,6 +226,7 @@ fn everything_comes_back() {
         paths,
         [
             "composition.safetensors",
+            "held_out/views.json",
             "held_out/walk_0007.ours.png",
             "metrics.json",
             "proxy.glb",
