@@ -271,15 +271,19 @@ impl BundleRenderer {
         crate::to_image(&self.model.image(&target))
     }
 
-    /// A reference view's camera, normalised frame.
+    /// The camera of a reference view or of a held-out view, normalised frame.
     ///
     /// # Errors
-    /// No reference view of that name.
-    pub fn reference_camera(&self, name: &str) -> Result<Camera, RenderError> {
-        let views = self.bundle.references()?;
-        let found = views.iter().find(|view| view.name == name);
-        found
-            .map(|view| view.camera)
+    /// No view of that name.
+    pub fn view_camera(&self, name: &str) -> Result<Camera, RenderError> {
+        let references = self.bundle.references()?;
+        let held_out = self.bundle.held_out_cameras()?;
+        references
+            .into_iter()
+            .map(|view| (view.name, view.camera))
+            .chain(held_out)
+            .find(|(known, _)| known == name)
+            .map(|(_, camera)| camera)
             .ok_or_else(|| RenderError::UnknownView { name: name.into() })
     }
 
