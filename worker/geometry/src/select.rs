@@ -20,8 +20,8 @@ const TARGET_GRID: usize = 64;
 const VIEW_GRID: usize = 64;
 /// Voxels across the surface: one sample is kept in each, so that what many views see does not count more.
 const VOXELS: f64 = 48.0;
-/// At most about this many samples are kept of a capture's surface, and this many views stand for all targets: the
-/// choice of 20 among 1000 references then takes seconds.
+/// From this many to twice as many samples are kept of a capture's surface, and at most [`TARGETS`] views stand for all
+/// targets: the choice of 20 among 1000 references then takes seconds.
 const SURFACE_SAMPLES: usize = 512;
 /// See [`SURFACE_SAMPLES`].
 const TARGETS: usize = 128;
