@@ -29,6 +29,8 @@ pub struct ChildCommand {
     pub program: PathBuf,
     /// Arguments before the job file.
     pub args: Vec<OsString>,
+    /// Added to the agent's environment.
+    pub envs: Vec<(OsString, OsString)>,
 }
 
 impl ChildCommand {
@@ -40,6 +42,7 @@ impl ChildCommand {
         Ok(Self {
             program: std::env::current_exe()?,
             args: vec!["exec".into(), "--job".into()],
+            envs: Vec::new(),
         })
     }
 }
@@ -89,6 +92,7 @@ impl Child {
             .env("OMP_NUM_THREADS", &threads)
             .env("MKL_NUM_THREADS", &threads)
             .env("RAYON_NUM_THREADS", &threads)
+            .envs(command.envs.iter().map(|(name, value)| (name, value)))
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -307,6 +311,7 @@ mod tests {
         let command = ChildCommand {
             program: "/bin/sh".into(),
             args: vec!["-c".into(), script.into()],
+            envs: vec![("IGN_TEST".into(), "set".into())],
         };
         Child::spawn(&command, Path::new("job.json"), Path::new("/"), 3).unwrap()
     }
@@ -327,7 +332,7 @@ mod tests {
     #[tokio::test]
     async fn events_and_garbage_are_told_apart() {
         let mut child = shell(
-            r#"echo loading; echo '{"event":"done","bundle":"/b"}'; printf '\377\376 half {"event"'; echo "$OMP_NUM_THREADS $0" >&2"#,
+            r#"echo loading; echo '{"event":"done","bundle":"/b"}'; printf '\377\376 half {"event"'; echo "$OMP_NUM_THREADS $0 $IGN_TEST" >&2"#,
         );
         let outputs = all(&mut child).await;
         assert!(
@@ -338,12 +343,12 @@ mod tests {
             bundle: "/b".into()
         })));
         assert!(
-            outputs.contains(&Output::Text("3 job.json".into())),
+            outputs.contains(&Output::Text("3 job.json set".into())),
             "{outputs:?}"
         );
         assert_eq!(outputs.len(), 4, "{outputs:?}");
         assert_eq!(child.ending().describe(), "exited with code 0");
-        assert_eq!(child.ending().last_lines, ["3 job.json"]);
+        assert_eq!(child.ending().last_lines, ["3 job.json set"]);
     }
 
     #[tokio::test]
@@ -440,6 +445,7 @@ mod tests {
         let command = ChildCommand {
             program: "/no/such/program".into(),
             args: Vec::new(),
+            envs: Vec::new(),
         };
         assert!(Child::spawn(&command, Path::new("job.json"), Path::new("/"), 1).is_err());
     }

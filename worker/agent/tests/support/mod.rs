@@ -450,6 +450,7 @@ pub(crate) fn config(coordinator: &Coordinator, dir: &std::path::Path) -> AgentC
         child: ChildCommand {
             program: env!("CARGO_BIN_EXE_ign-agent-test-child").into(),
             args: vec!["exec".into(), "--job".into()],
+            envs: Vec::new(),
         },
         shutdown_grace: Duration::from_secs(5),
         lease_wait: Duration::from_secs(1),

@@ -1,0 +1,133 @@
+//! `ign-worker agent`: runs `ign_agent` with this program's `exec` as the child.
+
+use std::io::Read;
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, ensure};
+use bytesize::ByteSize;
+use ign_agent::{AgentConfig, ChildCommand};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+use tracing_subscriber::EnvFilter;
+
+use crate::{gpu, output};
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Options {
+    /// The coordinator, http://HOST:PORT.
+    #[arg(long, env = "IGN_SERVER", value_name = "URL")]
+    server: String,
+    /// File that holds the bearer token.
+    #[arg(long, env = "IGN_TOKEN_FILE", value_name = "FILE")]
+    token_file: PathBuf,
+    /// Folder for cached captures and running jobs; belongs to this agent alone.
+    #[arg(long, env = "IGN_WORK_DIR", value_name = "DIR")]
+    work_dir: PathBuf,
+    /// Name of this worker [default: host name and process id].
+    #[arg(long, env = "IGN_WORKER_NAME")]
+    name: Option<String>,
+    /// CPU threads of a bake [default: all cores].
+    #[arg(long, env = "IGN_THREADS", value_name = "N")]
+    threads: Option<std::num::NonZero<usize>>,
+    /// Bound of the cache of captures and checkpoints.
+    #[arg(
+        long,
+        env = "IGN_CACHE_SIZE",
+        value_name = "SIZE",
+        default_value = "20GB"
+    )]
+    cache_size: ByteSize,
+    /// Stop when stdin ends: the agent then never outlives the program that started it.
+    #[arg(long)]
+    exit_when_stdin_closes: bool,
+}
+
+pub(crate) fn run(options: Options) -> Result<()> {
+    tracing_subscriber::fmt()
+        .with_env_filter(
+            EnvFilter::try_from_default_env().unwrap_or_else(|_unset| EnvFilter::new("info")),
+        )
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr()))
+        .with_target(false)
+        .init();
+    let token_file = options.token_file.display();
+    let token = std::fs::read_to_string(&options.token_file)
+        .with_context(|| format!("cannot read the token file {token_file}"))?;
+    let token = token.trim();
+    ensure!(!token.is_empty(), "the token file {token_file} is empty");
+
+    let shutdown = CancellationToken::new();
+    if options.exit_when_stdin_closes {
+        let shutdown = shutdown.clone();
+        std::thread::Builder::new()
+            .name("stdin".to_owned())
+            .spawn(move || {
+                until_end(&mut std::io::stdin().lock());
+                shutdown.cancel();
+            })?;
+    }
+    let gpu = gpu::probe();
+    let mut config = AgentConfig::new(&options.server, token, &options.work_dir)?;
+    config.name = options.name;
+    config.device = gpu.name;
+    env!("CARGO_PKG_VERSION").clone_into(&mut config.version);
+    config.cache_bytes = options.cache_size.as_u64();
+    config.child = ChildCommand {
+        envs: gpu.envs,
+        ..ChildCommand::current_exe()?
+    };
+    if let Some(threads) = options.threads {
+        config.threads = threads.get();
+    }
+    // One thread is enough for everything but hashing, and keeps the agent small.
+    tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .max_blocking_threads(4)
+        .build()?
+        .block_on(async {
+            tokio::spawn(stop_on_signal(
+                shutdown.clone(),
+                signal(SignalKind::terminate())?,
+                signal(SignalKind::interrupt())?,
+            ));
+            Ok(ign_agent::run(config, shutdown).await?)
+        })
+}
+
+/// The first signal asks for an orderly end, a second one does not wait for it.
+async fn stop_on_signal(
+    shutdown: CancellationToken,
+    mut terminate: tokio::signal::unix::Signal,
+    mut interrupt: tokio::signal::unix::Signal,
+) {
+    loop {
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+        }
+        if shutdown.is_cancelled() {
+            output::say("stopped before the job was handed back; its lease will run out");
+            die();
+        }
+        tracing::info!("stopping: the running job goes back to the queue");
+        shutdown.cancel();
+    }
+}
+
+/// Reads until end of file or an error, which means the same here.
+pub(crate) fn until_end(input: &mut impl Read) {
+    let mut buffer = [0; 256];
+    loop {
+        match input.read(&mut buffer) {
+            Ok(0) => return,
+            Err(error) if error.kind() != std::io::ErrorKind::Interrupted => return,
+            _ => {}
+        }
+    }
+}
+
+/// Ends this process at once. Ordinary exit would run the destructors of libraries whose threads still work.
+pub(crate) fn die() {
+    rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::KILL).ok();
+}

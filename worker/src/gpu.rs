@@ -1,0 +1,166 @@
+//! Finds out whether this machine's GPU can be used, without risk for the process that asks.
+//!
+//! The binary links libtorch's CPU library alone. Where the machine has an NVIDIA device and `libtorch_cuda.so` lies
+//! beside the CPU library (or `IGN_LIBTORCH_CUDA` names it), a child process of this program loads it first
+//! (`LD_PRELOAD`) and computes something. Only when that works do later processes load it; otherwise one line says
+//! why not, and the CPU is used. A broken driver can thus end the probe, never a bake. `IGN_DEVICE=cpu` skips all of
+//! this.
+
+use std::ffi::OsString;
+use std::io::Read;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, ensure};
+use tch::{Kind, Tensor};
+
+use crate::output;
+
+/// Set in processes whose device is settled.
+const SETTLED: &str = "IGN_DEVICE_SETTLED";
+/// Loading the CUDA library for the first time reads gigabytes.
+const PROBE_LIMIT: Duration = Duration::from_mins(3);
+
+/// What bakes run on, and the environment in which they do.
+#[derive(Debug)]
+pub(crate) struct Gpu {
+    /// For people: `NVIDIA H200`, `cpu`.
+    pub(crate) name: String,
+    pub(crate) envs: Vec<(OsString, OsString)>,
+}
+
+/// Settles the device for child processes of this one.
+pub(crate) fn probe() -> Gpu {
+    let settled = (OsString::from(SETTLED), OsString::from("1"));
+    let cpu = Gpu {
+        name: "cpu".to_owned(),
+        envs: vec![settled.clone()],
+    };
+    let Some(library) = cuda_library() else {
+        return cpu;
+    };
+    let envs = vec![settled, ("LD_PRELOAD".into(), library.clone().into())];
+    match probe_with(&envs) {
+        Ok(device) if device.starts_with("cuda") => Gpu {
+            name: model().unwrap_or(device),
+            envs,
+        },
+        Ok(_) => cpu,
+        Err(error) => {
+            let library = library.display();
+            output::say(&format!(
+                "the GPU cannot be used, going on with the CPU: {library}: {error:#}"
+            ));
+            cpu
+        }
+    }
+}
+
+/// Starts this process again with the CUDA library when that is of use; otherwise just returns.
+pub(crate) fn enable() -> Result<()> {
+    if std::env::var_os(SETTLED).is_some() {
+        return Ok(());
+    }
+    let gpu = probe();
+    if gpu.envs.len() < 2 {
+        return Ok(());
+    }
+    let error = Command::new(std::env::current_exe()?)
+        .args(std::env::args_os().skip(1))
+        .envs(gpu.envs)
+        .exec();
+    Err(error).context("cannot start again with the GPU's library")
+}
+
+/// In the probe's process: computes something on the device and names it.
+pub(crate) fn check() -> Result<String> {
+    let device = ign_nets::select_device();
+    let sum = Tensor::f_ones([64, 64], (Kind::Float, device))
+        .and_then(|ones| ones.f_matmul(&ones))
+        .and_then(|product| product.f_sum(Kind::Float))
+        .and_then(|sum| f64::try_from(sum))
+        .context("the device does not compute")?;
+    ensure!(
+        (sum - 262_144.0).abs() < 1.0,
+        "the device computes wrongly: {sum}"
+    );
+    Ok(ign_nets::device::name(device))
+}
+
+fn probe_with(envs: &[(OsString, OsString)]) -> Result<String> {
+    let mut probe = Command::new(std::env::current_exe()?)
+        .arg("device")
+        .envs(envs.iter().map(|(name, value)| (name, value)))
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()?;
+    let started = Instant::now();
+    let status = loop {
+        if let Some(status) = probe.try_wait()? {
+            break status;
+        }
+        if started.elapsed() > PROBE_LIMIT {
+            probe.kill().and_then(|()| probe.wait())?;
+            anyhow::bail!("no answer within {} s", PROBE_LIMIT.as_secs());
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    let read = |pipe: Option<&mut dyn Read>| -> Result<String> {
+        let mut bytes = Vec::new();
+        if let Some(pipe) = pipe {
+            pipe.take(4000).read_to_end(&mut bytes)?;
+        }
+        Ok(String::from_utf8_lossy(&bytes).trim().to_owned())
+    };
+    let complaint = read(probe.stderr.as_mut().map(|pipe| pipe as &mut dyn Read))?;
+    ensure!(
+        status.success(),
+        "{status}: {}",
+        complaint.lines().last().unwrap_or_default()
+    );
+    read(probe.stdout.as_mut().map(|pipe| pipe as &mut dyn Read))
+}
+
+/// The library to load, where a GPU and the library exist.
+fn cuda_library() -> Option<PathBuf> {
+    if std::env::var_os("IGN_DEVICE").is_some_and(|device| device == "cpu")
+        || !Path::new("/dev/nvidiactl").exists()
+    {
+        return None;
+    }
+    if let Some(library) = std::env::var_os("IGN_LIBTORCH_CUDA") {
+        return Some(library.into());
+    }
+    let maps = std::fs::read_to_string("/proc/self/maps").ok()?;
+    let cpu = maps
+        .lines()
+        .filter_map(|line| line.find('/').map(|start| &line[start..]))
+        .find(|path| path.ends_with("/libtorch_cpu.so"))?;
+    let library = Path::new(cpu).with_file_name("libtorch_cuda.so");
+    library.exists().then_some(library)
+}
+
+/// The GPU's model, as its driver names it.
+fn model() -> Option<String> {
+    let gpu = std::fs::read_dir("/proc/driver/nvidia/gpus")
+        .ok()?
+        .next()?
+        .ok()?;
+    let text = std::fs::read_to_string(gpu.path().join("information")).ok()?;
+    text.lines()
+        .find_map(|line| line.strip_prefix("Model:"))
+        .map(|model| model.trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_chosen_device_computes() {
+        assert!(["cpu", "cuda:0"].contains(&check().unwrap().as_str()));
+    }
+}
