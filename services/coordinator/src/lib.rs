@@ -1,1 +1,35 @@
 //! Coordinator: gRPC control plane and HTTP data plane on one port.
+//!
+//! ```text
+//!             one port, h2c and HTTP/1.1
+//!   trace -> cors -> auth -+-> ign.v1 (jobs, workers, bundles, collections) -> ign-queue (database)
+//!                          +-> /v2/... blobs and manifests (data_plane)     -> ign-registry (bucket)
+//!                          +-> /healthz /readyz /metrics, gRPC health and reflection
+//!   tasks: reap lost leases · mirror what is published into the bucket · drop stale uploads
+//! ```
+//!
+//! **Architecture invariants.** The coordinator decides nothing by itself: every rule about jobs is the queue's, under a
+//! row lock of the database, so that any number of coordinators may run on one database and bucket, and any of them may
+//! be killed at any point. Nothing is kept in memory that a restart needs. Only [`publish`] makes a bundle visible, and
+//! only after the database accepted the attempt. Requests without a token reach nothing but the health checks.
+
+mod app;
+mod auth;
+mod bundles;
+mod collections;
+mod config;
+mod convert;
+mod data_plane;
+mod error;
+mod http_answer;
+mod jobs;
+mod maintenance;
+mod metrics;
+mod operations;
+mod publish;
+mod server;
+mod trace;
+mod workers;
+
+pub use config::{Config, ServeError};
+pub use server::{Running, serve};

@@ -220,21 +220,21 @@ impl Registry {
 
     /// Fails unless every blob of the manifest is there with the size it says.
     pub async fn check_blobs(&self, manifest: &Manifest) -> Result<(), RegistryError> {
-        let sizes: BTreeMap<&Digest, BTreeSet<u64>> = manifest.files().iter().fold(
+        let sizes: BTreeMap<Digest, BTreeSet<u64>> = manifest.files().iter().fold(
             BTreeMap::new(),
             |mut sizes,
              FileEntry {
                  digest, size_bytes, ..
              }| {
-                sizes.entry(digest).or_default().insert(*size_bytes);
+                sizes.entry(digest.clone()).or_default().insert(*size_bytes);
                 sizes
             },
         );
         let missing: Vec<Digest> = futures::stream::iter(sizes)
             .map(|(digest, claimed)| async move {
-                let size = self.blob_size(digest).await?;
+                let size = self.blob_size(&digest).await?;
                 let right = claimed.iter().all(|claim| Some(*claim) == size);
-                Ok::<_, RegistryError>((!right).then(|| digest.clone()))
+                Ok::<_, RegistryError>((!right).then_some(digest))
             })
             .buffered(CHECKS_IN_FLIGHT)
             .try_filter_map(|missing| async move { Ok(missing) })

@@ -9,13 +9,15 @@
 
 use std::fmt;
 use std::str::FromStr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::{Bytes, BytesMut};
+use futures::stream::BoxStream;
 use futures::{Stream, StreamExt as _, TryStreamExt as _};
 use ign_proto::{Digest, ObjectName};
 use object_store::path::Path;
-use object_store::{ObjectMeta, ObjectStore as _, ObjectStoreExt as _};
+use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
 use uuid::Uuid;
 
 use crate::blobs::PART_BYTES;
@@ -144,17 +146,10 @@ impl Registry {
         let parts = self.upload_parts(id).await?;
         let store = self.store.clone();
         let body = futures::stream::iter(parts)
-            .then(move |part| {
-                let store = store.clone();
-                async move {
-                    store
-                        .get(&part.path)
-                        .await
-                        .map(object_store::GetResult::into_stream)
-                }
-            })
+            .then(move |part| open(store.clone(), part.path))
             .try_flatten()
-            .map_err(|error| Box::new(error) as BodyError);
+            .map_err(|error| Box::new(error) as BodyError)
+            .boxed();
         let size_bytes = self.put_stream(expected, limit_bytes, body).await?;
         self.drop_upload(id).await?;
         Ok(size_bytes)
@@ -259,4 +254,12 @@ impl Registry {
             Err(error) => Err(store_error("delete", path)(error)),
         }
     }
+}
+
+/// The content of one object.
+async fn open(
+    store: Arc<dyn ObjectStore>,
+    path: Path,
+) -> object_store::Result<BoxStream<'static, object_store::Result<Bytes>>> {
+    Ok(store.get(&path).await?.into_stream())
 }

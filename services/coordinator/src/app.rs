@@ -1,0 +1,23 @@
+//! What all handlers share.
+
+use std::sync::Arc;
+
+use ign_queue::Store;
+use ign_registry::Registry;
+use tokio_util::sync::CancellationToken;
+
+use crate::auth::Token;
+use crate::metrics::Metrics;
+use crate::publish::Mirror;
+
+/// The coordinator's parts; one for all connections.
+pub(crate) struct App {
+    pub(crate) store: Arc<dyn Store>,
+    pub(crate) registry: Registry,
+    pub(crate) token: Token,
+    pub(crate) metrics: Metrics,
+    pub(crate) mirror: Mirror,
+    pub(crate) redirect_blobs: bool,
+    /// Cancelled when the coordinator is to end: long polls and streams end then.
+    pub(crate) stopping: CancellationToken,
+}

@@ -1,0 +1,81 @@
+//! `ign.v1.Bundles`: what is published, and under which names.
+
+use std::sync::Arc;
+
+use ign_proto::v1;
+use ign_proto::v1::bundles_server::Bundles;
+use ign_queue::VersionFilter;
+use tonic::{Request, Response, Status};
+
+use crate::app::App;
+use crate::convert::{object_name, optional, to_bundle};
+use crate::http_answer::Refused;
+
+type Answer<T> = Result<Response<T>, Status>;
+
+/// Serves `ign.v1.Bundles`.
+pub(crate) struct BundlesApi(pub(crate) Arc<App>);
+
+#[tonic::async_trait]
+impl Bundles for BundlesApi {
+    async fn list(
+        &self,
+        request: Request<v1::ListBundlesRequest>,
+    ) -> Answer<v1::ListBundlesResponse> {
+        let request = request.into_inner();
+        let filter = VersionFilter {
+            collection: optional(&request.collection, "collection")?,
+            object: optional(&request.object, "object")?,
+            include_retired: request.include_retired,
+        };
+        let versions = self
+            .0
+            .store
+            .versions(&filter)
+            .await
+            .map_err(Refused::from)?;
+        Ok(Response::new(v1::ListBundlesResponse {
+            bundles: versions.into_iter().map(to_bundle).collect(),
+        }))
+    }
+
+    async fn get(&self, request: Request<v1::GetBundleRequest>) -> Answer<v1::BundleVersion> {
+        let request = request.into_inner();
+        let object = object_name(request.object.as_ref())?;
+        let version = self
+            .0
+            .store
+            .version(&object, &request.reference)
+            .await
+            .map_err(Refused::from)?;
+        Ok(Response::new(to_bundle(version)))
+    }
+
+    async fn set_alias(&self, request: Request<v1::SetAliasRequest>) -> Answer<v1::BundleVersion> {
+        let request = request.into_inner();
+        let object = object_name(request.object.as_ref())?;
+        let version = self
+            .0
+            .store
+            .set_alias(&object, &request.reference, &request.alias)
+            .await
+            .map_err(Refused::from)?;
+        self.0.mirror(&object, Some(version.version)).await;
+        tracing::info!(object = %object, version = version.version, alias = request.alias, "alias moved");
+        Ok(Response::new(to_bundle(version)))
+    }
+
+    async fn retire(&self, request: Request<v1::GetBundleRequest>) -> Answer<v1::BundleVersion> {
+        let request = request.into_inner();
+        let object = object_name(request.object.as_ref())?;
+        let version = self
+            .0
+            .store
+            .retire(&object, &request.reference)
+            .await
+            .map_err(Refused::from)?;
+        self.0.mirror(&object, Some(version.version)).await;
+        tracing::info!(object = %object, version = version.version, "version retired");
+        Ok(Response::new(to_bundle(version)))
+    }
+}

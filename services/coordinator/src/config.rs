@@ -1,0 +1,79 @@
+//! What a coordinator needs to know, and why it may not start.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use ign_queue::{Settings, StoreError};
+use ign_registry::{RegistryError, StoreConfig};
+
+/// Settings of one coordinator.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// Where to listen; port 0 takes a free one.
+    pub listen: SocketAddr,
+    /// `sqlite:///path` or `postgres://...`.
+    pub database: String,
+    /// Where blobs, manifests and versions lie.
+    pub store: StoreConfig,
+    /// File that holds the bearer token of all clients.
+    pub token_file: PathBuf,
+    /// Where to write `{"url","pid","token_file"}` once listening; removed at the end.
+    pub endpoint_file: Option<PathBuf>,
+    /// Lease, back-off and polling times.
+    pub settings: Settings,
+    /// Answer blob reads with a redirect to a signed URL where the store can sign. Clients must be able to reach the
+    /// store under the same address.
+    pub redirect_blobs: bool,
+}
+
+/// Why a coordinator did not start or had to end.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// The token file is absent or unusable.
+    #[error("token file {}: {reason}", path.display())]
+    Token {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The address cannot be listened on.
+    #[error("cannot listen on {address}")]
+    Listen {
+        /// As configured.
+        address: SocketAddr,
+        /// What the system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The database cannot be opened.
+    #[error("cannot open the database")]
+    Database {
+        /// What it said.
+        #[source]
+        source: StoreError,
+    },
+    /// The object store cannot be opened, written and read.
+    #[error("cannot open the object store")]
+    Registry {
+        /// What it said.
+        #[source]
+        source: RegistryError,
+    },
+    /// The endpoint file cannot be written.
+    #[error("cannot write {}", path.display())]
+    Endpoint {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// A task of the coordinator panicked.
+    #[error("a task of the coordinator stopped")]
+    Task {
+        /// Which way.
+        #[source]
+        source: tokio::task::JoinError,
+    },
+}

@@ -1,0 +1,112 @@
+//! `ign-coordinator`: one coordinator as a process. See the library for what it serves.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::{Parser, ValueEnum};
+use ign_coordinator::{Config, serve};
+use ign_queue::Settings;
+use ign_registry::StoreConfig;
+use tokio::signal::unix::{SignalKind, signal};
+use tracing_subscriber::EnvFilter;
+
+/// Serves jobs, workers, captures and bundles on one port.
+///
+/// S3 credentials and endpoint come from the usual variables: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION,
+/// AWS_ENDPOINT, AWS_ALLOW_HTTP.
+#[derive(Debug, Parser)]
+#[command(version)]
+struct Args {
+    /// Address to listen on; port 0 takes a free one.
+    #[arg(long, env = "IGN_LISTEN", default_value = "127.0.0.1:0")]
+    listen: SocketAddr,
+    /// sqlite:///path or postgres://user@host/database.
+    #[arg(long, env = "IGN_DATABASE", hide_env_values = true)]
+    database: String,
+    /// file:///folder or s3://bucket/prefix.
+    #[arg(long, env = "IGN_STORE")]
+    store: String,
+    /// File with the bearer token that every client must show.
+    #[arg(long, env = "IGN_TOKEN_FILE")]
+    token_file: PathBuf,
+    /// Where to write url, pid and token file as JSON once listening.
+    #[arg(long, env = "IGN_ENDPOINT_FILE")]
+    endpoint_file: Option<PathBuf>,
+    /// How long a worker may be silent before its job is given to another.
+    #[arg(long, env = "IGN_LEASE_SECS", default_value_t = 45.0, value_parser = lease_secs)]
+    lease_secs: f64,
+    /// Send readers of blobs to the object store by signed URL, where it can sign. Turn off where clients cannot reach
+    /// the store under the address that the coordinator uses.
+    #[arg(long, env = "IGN_REDIRECT_BLOBS", default_value_t = true, action = clap::ArgAction::Set)]
+    redirect_blobs: bool,
+    /// Form of the log on stderr; IGN_LOG sets the level (info, debug, ign_coordinator=debug, ...).
+    #[arg(long, env = "IGN_LOG_FORMAT", value_enum, default_value = "text")]
+    log_format: LogFormat,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum LogFormat {
+    Text,
+    Json,
+}
+
+fn lease_secs(text: &str) -> Result<f64, String> {
+    let secs: f64 = text
+        .parse()
+        .map_err(|_error| "expected a number of seconds".to_owned())?;
+    if (0.2..=3600.0).contains(&secs) {
+        Ok(secs)
+    } else {
+        Err("expected 0.2 to 3600 seconds".to_owned())
+    }
+}
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    let filter = EnvFilter::try_from_env("IGN_LOG").unwrap_or_else(|_unset| EnvFilter::new("info"));
+    let log = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr);
+    match args.log_format {
+        LogFormat::Text => log.with_ansi(false).init(),
+        LogFormat::Json => log.json().init(),
+    }
+    match run(args) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!("{error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+#[tokio::main]
+async fn run(args: Args) -> anyhow::Result<()> {
+    let (mut interrupt, mut terminate) = (
+        signal(SignalKind::interrupt())?,
+        signal(SignalKind::terminate())?,
+    );
+    let config = Config {
+        listen: args.listen,
+        database: args.database,
+        store: StoreConfig::new(args.store),
+        token_file: args.token_file,
+        endpoint_file: args.endpoint_file,
+        settings: Settings {
+            lease: Duration::from_secs_f64(args.lease_secs),
+            ..Settings::default()
+        },
+        redirect_blobs: args.redirect_blobs,
+    };
+    let shutdown = async move {
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
+        tracing::info!("asked to stop");
+    };
+    serve(config, shutdown).await?.wait().await?;
+    Ok(())
+}

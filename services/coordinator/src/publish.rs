@@ -1,0 +1,153 @@
+//! Publishing a bundle, and the bucket's copy of what is published.
+//!
+//! Order of a publish, each step idempotent, so that a call cut anywhere is repeated by the worker:
+//! 1. every blob is there with its size; 2. the manifest is written (nobody names it yet); 3. the database, under the
+//! job's row lock and after checking the attempt, makes it version N and ends the job: this alone is the commit;
+//! 4. the bucket gets the version's record and the object's aliases.
+//!
+//! A crash between 3 and 4 is repaired by [`App::mirror_all`] at start; a store that failed is tried again by the
+//! maintenance task. Aliases are written as the database has them at that time, and read again afterwards until both
+//! agree, so that two writers end at the newer state.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Mutex;
+
+use futures::stream::{self, StreamExt as _};
+use ign_proto::{Attempt, JobId, Manifest, ObjectName};
+use ign_queue::{NewVersion, Version, VersionFilter};
+use ign_registry::{ObjectState, VersionRecord};
+
+use crate::app::App;
+use crate::http_answer::Refused;
+
+const OBJECTS_IN_FLIGHT: usize = 8;
+
+/// Objects whose copy in the bucket is behind.
+#[derive(Debug, Default)]
+pub(crate) struct Mirror {
+    behind: Mutex<BTreeSet<ObjectName>>,
+}
+
+impl Mirror {
+    fn behind(&self) -> std::sync::MutexGuard<'_, BTreeSet<ObjectName>> {
+        self.behind
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+}
+
+impl App {
+    /// Makes the bundle the object's next version and ends the job; the same call again gives the same version.
+    pub(crate) async fn publish(
+        &self,
+        job: JobId,
+        attempt: Attempt,
+        manifest: &Manifest,
+        metrics_json: String,
+    ) -> Result<Version, Refused> {
+        let manifest_digest = self.registry.put_manifest(manifest).await?;
+        let bundle = NewVersion {
+            manifest_digest,
+            size_bytes: manifest.size_bytes(),
+            file_count: manifest.files().len() as u32,
+            metrics_json,
+        };
+        let version = self
+            .store
+            .publish_and_complete(job, attempt, bundle)
+            .await?;
+        self.mirror(&version.object, Some(version.version)).await;
+        Ok(version)
+    }
+
+    /// Brings the bucket's copy of an object up to date, of one version or of all. A failure is logged and tried again
+    /// later: what the database committed stands.
+    pub(crate) async fn mirror(&self, object: &ObjectName, version: Option<u32>) {
+        if let Err(Refused(cause)) = self.try_mirror(object, version).await {
+            tracing::warn!(object = %object, error = %cause, "the bucket's record of versions is behind; trying again later");
+            self.mirror.behind().insert(object.clone());
+        }
+    }
+
+    async fn try_mirror(&self, object: &ObjectName, only: Option<u32>) -> Result<(), Refused> {
+        let filter = VersionFilter {
+            collection: Some(object.collection.clone()),
+            object: Some(object.object.clone()),
+            include_retired: true,
+        };
+        let mut versions = self.store.versions(&filter).await?;
+        for version in versions
+            .iter()
+            .filter(|it| only.is_none_or(|only| it.version == only))
+        {
+            self.registry.put_version(&record(version)).await?;
+        }
+        loop {
+            let state = state(&versions);
+            self.registry.put_state(object, &state).await?;
+            versions = self.store.versions(&filter).await?;
+            if self::state(&versions) == state {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Repairs the bucket's copy of every object.
+    pub(crate) async fn mirror_all(&self) {
+        let all = VersionFilter {
+            include_retired: true,
+            ..VersionFilter::default()
+        };
+        let objects: BTreeSet<ObjectName> = match self.store.versions(&all).await {
+            Ok(versions) => versions.into_iter().map(|version| version.object).collect(),
+            Err(error) => {
+                let Refused(cause) = error.into();
+                tracing::warn!(error = %cause, "could not list versions to check the bucket's record of them");
+                return;
+            }
+        };
+        stream::iter(objects)
+            .for_each_concurrent(OBJECTS_IN_FLIGHT, |object| async move {
+                self.mirror(&object, None).await
+            })
+            .await;
+    }
+
+    /// Tries again what failed.
+    pub(crate) async fn mirror_behind(&self) {
+        let behind = std::mem::take(&mut *self.mirror.behind());
+        for object in behind {
+            self.mirror(&object, None).await;
+        }
+    }
+}
+
+fn record(version: &Version) -> VersionRecord {
+    VersionRecord {
+        object: version.object.clone(),
+        version: version.version,
+        manifest_digest: version.bundle.manifest_digest.clone(),
+        size_bytes: version.bundle.size_bytes,
+        job_id: version.job,
+        created_at: version.created_at,
+        metrics_json: version.bundle.metrics_json.clone(),
+    }
+}
+
+fn state(versions: &[Version]) -> ObjectState {
+    let aliases: BTreeMap<String, u32> = versions
+        .iter()
+        .flat_map(|version| {
+            version
+                .aliases
+                .iter()
+                .map(|alias| (alias.clone(), version.version))
+        })
+        .collect();
+    let retired = versions
+        .iter()
+        .filter(|version| version.retired)
+        .map(|version| version.version)
+        .collect();
+    ObjectState { aliases, retired }
+}
