@@ -59,6 +59,27 @@ struct Current {
     rate_scale: f64,
     fallbacks: u32,
     adam_steps: Vec<u64>,
+    /// Lowest observed error.
+    best_error: Option<f64>,
+}
+
+/// What a stage's training leaves.
+pub(crate) struct Outcome {
+    pub(crate) trainees: Vec<Trainee>,
+    /// Averaged weights of the first network at the observation with the lowest error.
+    best: Option<Vec<f32>>,
+}
+
+impl Outcome {
+    /// The first network with its averaged weights of the best observation; without observations, of the end.
+    pub(crate) fn best(&self) -> Result<Params, BakeError> {
+        let Trainee { params, adam } = &self.trainees[0];
+        let averaged = adam.averaged(params);
+        if let Some(best) = &self.best {
+            averaged.restore(best)?;
+        }
+        Ok(averaged)
+    }
 }
 
 /// How long a stage trains.
@@ -84,16 +105,18 @@ pub(crate) struct Session<'a> {
 struct Snapshot {
     flat: Vec<Vec<f32>>,
     adam: Vec<AdamState>,
+    best: Option<Vec<f32>>,
 }
 
 impl Snapshot {
-    fn of(trainees: &[Trainee]) -> Self {
+    fn of(trainees: &[Trainee], best: Option<&Vec<f32>>) -> Self {
         Self {
             flat: trainees
                 .iter()
                 .map(|t| flat_values(t.params.flat()))
                 .collect(),
             adam: trainees.iter().map(|t| t.adam.state()).collect(),
+            best: best.cloned(),
         }
     }
 
@@ -197,11 +220,13 @@ impl<'a> Session<'a> {
         schedule: Schedule,
         mut step: impl FnMut(&mut [Trainee], u64, f64, f64) -> f64,
         mut observe: impl FnMut(&mut Self, &[Trainee], f64) -> Result<Option<f64>, BakeError>,
-    ) -> Result<Vec<Trainee>, BakeError> {
+    ) -> Result<Outcome, BakeError> {
+        let mut best = None;
         let mut current = match self.meta.current.take() {
             Some(current) if current.stage == stage => {
                 if let Some(snapshot) = self.resumed.take() {
                     snapshot.restore(&mut trainees)?;
+                    best = snapshot.best;
                 }
                 self.reporter.info(format!(
                     "{stage}: resumed at step {} from the checkpoint",
@@ -217,10 +242,11 @@ impl<'a> Session<'a> {
                 rate_scale: 1.0,
                 fallbacks: 0,
                 adam_steps: Vec::new(),
+                best_error: None,
             },
         };
-        let mut good = (current.clone(), Snapshot::of(&trainees));
-        let mut clock = Instant::now();
+        let mut good = (current.clone(), Snapshot::of(&trainees, best.as_ref()));
+        let clock = Instant::now();
         let before = current.elapsed_secs;
         let mut elapsed = before;
         let mut paused = 0.0;
@@ -236,8 +262,14 @@ impl<'a> Session<'a> {
                 let error = observe(self, &trainees, elapsed)?;
                 if let Some(error) = error {
                     self.reporter.error(error);
+                    if current.best_error.is_none_or(|lowest| error <= lowest) {
+                        current.best_error = Some(error);
+                        best = Some(flat_values(
+                            trainees[0].adam.averaged(&trainees[0].params).flat(),
+                        ));
+                    }
                 }
-                good = (current.clone(), Snapshot::of(&trainees));
+                good = (current.clone(), Snapshot::of(&trainees, best.as_ref()));
                 paused += pause.elapsed().as_secs_f64();
             }
             if fraction >= 1.0 {
@@ -267,12 +299,10 @@ impl<'a> Session<'a> {
                 .step(fraction, &format!("step {} loss {loss:.4}", current.step));
             if self.last_saved.elapsed().as_secs_f64() >= self.interval_secs {
                 let pause = Instant::now();
-                self.save(Some((&current, &trainees)))?;
+                self.save(Some((&current, &Snapshot::of(&trainees, best.as_ref()))))?;
                 paused += pause.elapsed().as_secs_f64();
             }
         }
-        clock = Instant::now();
-        tracing::debug!(secs = clock.elapsed().as_secs_f64(), stage, "stage ended");
         self.meta.secs.insert(stage.into(), elapsed);
         let skipped: u64 = trainees.iter().map(|t| t.adam.skipped()).sum();
         if skipped > 0 {
@@ -280,7 +310,7 @@ impl<'a> Session<'a> {
                 "{stage}: {skipped} steps had gradients that were not finite and were left out"
             ));
         }
-        Ok(trainees)
+        Ok(Outcome { trainees, best })
     }
 
     /// Keeps a stage's weights and writes a checkpoint.
@@ -295,7 +325,7 @@ impl<'a> Session<'a> {
         self.save(None)
     }
 
-    fn save(&mut self, current: Option<(&Current, &[Trainee])>) -> Result<(), BakeError> {
+    fn save(&mut self, current: Option<(&Current, &Snapshot)>) -> Result<(), BakeError> {
         let mut meta = self.meta.clone();
         let mut tensors: Vec<(String, Vec<usize>, Vec<u8>)> = Vec::new();
         for (stage, weights) in &self.weights {
@@ -304,11 +334,13 @@ impl<'a> Session<'a> {
                 tensors.push((format!("finished/{stage}/{name}"), shape, bytes(values)));
             }
         }
-        if let Some((current, trainees)) = current {
-            let snapshot = Snapshot::of(trainees);
+        if let Some((current, snapshot)) = current {
             let mut current = current.clone();
             current.adam_steps = snapshot.adam.iter().map(|state| state.steps).collect();
             meta.current = Some(current);
+            if let Some(best) = &snapshot.best {
+                tensors.push(("current/best".into(), vec![best.len()], bytes(best)));
+            }
             for (index, (flat, adam)) in snapshot.flat.iter().zip(&snapshot.adam).enumerate() {
                 for (name, values) in [
                     ("flat", flat),
@@ -401,7 +433,11 @@ impl<'a> Session<'a> {
             let mut snapshot = Snapshot {
                 flat: Vec::new(),
                 adam: Vec::new(),
+                best: None,
             };
+            if current.best_error.is_some() {
+                snapshot.best = Some(values("current/best")?.1);
+            }
             for (index, &steps) in current.adam_steps.iter().enumerate() {
                 let part = |name: &str| {
                     values(&format!("current/{index}/{name}")).map(|(_, values)| values)

@@ -90,7 +90,7 @@ fn mean_errors(views: &[Watched<'_>], image: impl Fn(&Stored) -> Tensor) -> (f64
         let (full, object) = no_grad(|| {
             let image = image(&view.input).nan_to_num(0.0, 1.0, 0.0).clamp(0.0, 1.0)
                 * &view.scored.target.coverage;
-            errors_255(&image, &view.scored)
+            errors_255(&image, view.scored)
         });
         sums = (sums.0 + full, sums.1 + object);
     }
@@ -112,7 +112,7 @@ fn examples(
         );
         let scored = data.scored(view)?;
         let input = model.blend_input(&scored.target);
-        let coverage = &scored.target.coverage * &scored.scored;
+        let coverage = &scored.target.coverage * &scored.counted;
         let Some((y, x, h, w)) = bounds(&coverage, patch) else {
             continue;
         };
@@ -207,12 +207,11 @@ pub(crate) fn train_blend(
     let net = BlendComposition::new(&mut builder, data.settings.k);
     let params = builder.build(data.device, plan.seed);
     let adam = Adam::new(&params, AVERAGE_DECAY);
-    let mut best: Option<(f64, Params)> = None;
     let forward = |params: &Params, input: &Stored| match input {
         Stored::Blend(input) => net.forward(params, &with_kind(input, Kind::Float)),
         Stored::Paper(_) => unreachable!("blend models watch blend inputs"),
     };
-    let trainees = session.train(
+    let outcome = session.train(
         plan.stage,
         vec![Trainee { params, adam }],
         plan.schedule,
@@ -266,15 +265,10 @@ pub(crate) fn train_blend(
             let error = observe(session, plan, validation, held_out, secs, |input| {
                 forward(&averaged, input)
             });
-            if best.as_ref().is_none_or(|(lowest, _)| error <= *lowest) {
-                best = Some((error, averaged));
-            }
             Ok(Some(error))
         },
     )?;
-    let last = trainees[0].adam.averaged(&trainees[0].params);
-    let kept = best.map_or(last, |(_, params)| params);
-    session.finish(plan.stage, &kept)
+    session.finish(plan.stage, &outcome.best()?)
 }
 
 /// Records a point of the curve; the validation error, or the held-out one where there are no validation views.
@@ -315,7 +309,7 @@ pub(crate) fn train_paper(
         examples.push((
             model.paper_input(&scored.target).to_kind(Kind::Half),
             scored.truth.to_kind(Kind::Half),
-            (&scored.target.coverage * &scored.scored).to_kind(Kind::Half),
+            (&scored.target.coverage * &scored.counted).to_kind(Kind::Half),
         ));
     }
     let mut builder = Builder::new();
@@ -334,7 +328,7 @@ pub(crate) fn train_paper(
         adam: Adam::new(&params, 0.0),
         params,
     };
-    let trainees = session.train(
+    let outcome = session.train(
         plan.stage,
         vec![generator, discriminator],
         plan.schedule,
@@ -363,7 +357,7 @@ pub(crate) fn train_paper(
                     .adam
                     .step(&mut discriminator.params, 1e-3 * scale, f64::INFINITY);
                 let verdict = critic.forward(&discriminator.params, &input, &image, true);
-                loss = loss + adversarial_loss(&verdict, true) * ADVERSARIAL;
+                loss += adversarial_loss(&verdict, true) * ADVERSARIAL;
             }
             let value = loss.double_value(&[]);
             loss.backward();
@@ -392,5 +386,5 @@ pub(crate) fn train_paper(
             Ok(Some(error))
         },
     )?;
-    session.finish(plan.stage, &trainees[0].params)
+    session.finish(plan.stage, &outcome.trainees[0].params)
 }

@@ -45,7 +45,7 @@ pub(crate) struct Scored {
     /// [1, 3, H, W]: encoded sRGB, black outside the object.
     pub(crate) truth: Tensor,
     /// [1, 1, H, W]: 0 where both images are black before scoring, else 1.
-    pub(crate) scored: Tensor,
+    pub(crate) counted: Tensor,
     /// Row-major: on the object.
     pub(crate) object: Vec<bool>,
     /// [1, 1, H, W]: the same.
@@ -166,7 +166,7 @@ impl<'a> Dataset<'a> {
         Ok(Scored {
             target,
             truth: truth.to_device(self.device),
-            scored: Tensor::from_slice(&scored)
+            counted: Tensor::from_slice(&scored)
                 .view([1, 1, h, w])
                 .to_device(self.device),
             object_mask: Tensor::from_slice(&object)
@@ -305,7 +305,7 @@ fn inside_only(image: &ViewImage, mask: &[f32]) -> (Vec<f32>, Vec<f32>) {
 /// Mean squared errors on [0, 255] of `image` [1, 3, H, W] against a view's truth, both as 8-bit files would hold
 /// them: over the full frame and over the object.
 pub(crate) fn errors_255(image: &Tensor, view: &Scored) -> (f64, f64) {
-    let difference = color::quantised(&(image * &view.scored)) - color::quantised(&view.truth);
+    let difference = color::quantised(&(image * &view.counted)) - color::quantised(&view.truth);
     let squared = (difference * 255.0).square();
     let object = view.object_mask.sum(Kind::Float).clamp_min(1.0) * 3.0;
     let on_object = (&squared * &view.object_mask).sum(Kind::Float) / object;

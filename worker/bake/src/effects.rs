@@ -226,7 +226,7 @@ pub(crate) fn train_points(
     let adam = Adam::new(&params, AVERAGE_DECAY);
     let count = observations.points.size()[0];
     let views = observations.sources.len() as i64;
-    let trainees = session.train(
+    let outcome = session.train(
         STAGE,
         vec![Trainee { params, adam }],
         schedule,
@@ -249,8 +249,7 @@ pub(crate) fn train_points(
         },
         |_, _, _| Ok(None),
     )?;
-    let averaged = trainees[0].adam.averaged(&trainees[0].params);
-    session.finish(STAGE, &averaged)
+    session.finish(STAGE, &outcome.best()?)
 }
 
 /// Mean prediction error over the pairs that see each other, plus the sparsity term; `None` when no pair does.
@@ -388,7 +387,7 @@ pub(crate) fn train_paper(
     let net = PaperEffects::new(&mut builder);
     let params = builder.build(data.device, seed);
     let adam = Adam::new(&params, 0.0);
-    let trainees = session.train(
+    let outcome = session.train(
         stage,
         vec![Trainee { params, adam }],
         schedule,
@@ -427,5 +426,5 @@ pub(crate) fn train_paper(
         },
         |_, _, _| Ok(None),
     )?;
-    session.finish(stage, &trainees[0].params)
+    session.finish(stage, &outcome.trainees[0].params)
 }

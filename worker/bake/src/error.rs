@@ -51,6 +51,12 @@ pub enum BakeError {
         #[source]
         source: image::ImageError,
     },
+    /// The turntable preview could not be encoded.
+    #[error("preview.webp cannot be encoded: {reason}")]
+    Animation {
+        /// The encoder's reason.
+        reason: String,
+    },
     /// A file could not be read or written.
     #[error("{path} cannot be written or read")]
     Io {
@@ -116,6 +122,7 @@ impl BakeError {
             | Self::Checkpoint { .. }
             | Self::Bundle(_)
             | Self::Picture { .. }
+            | Self::Animation { .. }
             | Self::Diverged { .. } => text(FailureKind::Crashed, String::new(), String::new()),
         }
     }

@@ -29,7 +29,7 @@ pub(crate) fn score(
         let start = Instant::now();
         let image = render(&scored.target);
         millis.push(start.elapsed().as_secs_f64() * 1e3);
-        let image = to_image(&(image * &scored.scored));
+        let image = to_image(&(image * &scored.counted));
         let score = Scores::of(&image, &to_image(&scored.truth), &scored.object);
         per_view.push(ViewMetrics {
             name: view.clone(),

@@ -13,7 +13,6 @@ use ign_bundle::{BundleWriter, COMPOSITION_FILE, EFFECTS_FILE, Manifest, Precisi
 use ign_nets::color;
 use ign_render::{Effects, Model, NetworkFiles, ReferenceImage, Target, orbit, to_image};
 use image::codecs::jpeg::JpegEncoder;
-use image::codecs::webp::WebPEncoder;
 use image::{ExtendedColorType, ImageEncoder, RgbImage};
 
 use crate::BakeError;
@@ -23,11 +22,13 @@ use crate::progress::Reporter;
 use crate::recipe::Settings;
 use crate::run::BakeJob;
 
-/// Frames of the turntable preview, laid out side by side in one picture.
-const PREVIEW_FRAMES: usize = 24;
-/// Frames per row of the preview.
-const PREVIEW_COLUMNS: u32 = 6;
-/// Pixels of one preview frame.
+/// Frames of the turntable preview.
+const PREVIEW_FRAMES: usize = 36;
+/// Milliseconds that a frame stays: one round in about three seconds.
+const PREVIEW_FRAME_MS: i32 = 90;
+/// WebP's quality, 0 to 100.
+const PREVIEW_QUALITY: f32 = 85.0;
+/// Pixels of a preview frame's sides.
 const PREVIEW_PX: u32 = 192;
 /// Held-out views that the report shows.
 const REPORT_VIEWS: usize = 4;
@@ -111,12 +112,16 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
             writer.held_out(name, "target", &to_image(&scored.truth))?;
         }
     }
-    let preview = preview(data, model);
-    writer.file("preview.webp", &webp(&preview)?)?;
-    writer.file(
-        "thumbnail.jpg",
-        &jpeg(&image::imageops::crop_imm(&preview, 0, 0, PREVIEW_PX, PREVIEW_PX).to_image())?,
-    )?;
+    let held_out_cameras: Vec<_> = views
+        .iter()
+        .map(|(name, scored)| (name.clone(), scored.target.camera))
+        .collect();
+    writer.held_out_cameras(&held_out_cameras)?;
+    let frames = turntable(data, model, reporter);
+    writer.file("preview.webp", &animation(&frames)?)?;
+    if let Some(first) = frames.first() {
+        writer.file("thumbnail.jpg", &jpeg(first)?)?;
+    }
 
     let report_views = report_views(views, &rows, model);
     metrics.methods = rows.into_iter().map(|row| row.metrics).collect();
@@ -238,44 +243,40 @@ fn report_views(views: &[(String, &Scored)], rows: &[Row], model: &Model) -> Vec
         .collect()
 }
 
-/// A turntable as one picture of frames, row by row.
-fn preview(data: &Dataset<'_>, model: &Model) -> RgbImage {
-    let rows = (PREVIEW_FRAMES as u32).div_ceil(PREVIEW_COLUMNS);
-    let mut sheet = RgbImage::new(PREVIEW_COLUMNS * PREVIEW_PX, rows * PREVIEW_PX);
-    for (index, camera) in orbit(&model.references.cameras, PREVIEW_FRAMES, PREVIEW_PX)
+/// One round around the object.
+fn turntable(data: &Dataset<'_>, model: &Model, reporter: &Reporter<'_>) -> Vec<RgbImage> {
+    let cameras = orbit(&model.references.cameras, PREVIEW_FRAMES, PREVIEW_PX);
+    cameras
         .iter()
         .enumerate()
-    {
-        let target = Target::new(&data.mesh, camera, &data.settings, data.device);
-        let frame = to_image(&model.image(&target));
-        let (x, y) = (
-            index as u32 % PREVIEW_COLUMNS,
-            index as u32 / PREVIEW_COLUMNS,
-        );
-        image::imageops::replace(
-            &mut sheet,
-            &frame,
-            i64::from(x * PREVIEW_PX),
-            i64::from(y * PREVIEW_PX),
-        );
-    }
-    sheet
+        .map(|(at, camera)| {
+            reporter.step(at as f64 / PREVIEW_FRAMES as f64, "rendering the turntable");
+            let target = Target::new(&data.mesh, camera, &data.settings, data.device);
+            to_image(&model.image(&target))
+        })
+        .collect()
 }
 
-fn webp(image: &RgbImage) -> Result<Vec<u8>, BakeError> {
-    let mut bytes = Vec::new();
-    WebPEncoder::new_lossless(Cursor::new(&mut bytes))
-        .write_image(
-            image,
-            image.width(),
-            image.height(),
-            ExtendedColorType::Rgb8,
-        )
-        .map_err(|source| BakeError::Picture {
-            file: "preview.webp",
-            source,
-        })?;
-    Ok(bytes)
+/// The frames as an animated WebP that runs for ever.
+fn animation(frames: &[RgbImage]) -> Result<Vec<u8>, BakeError> {
+    let failed = |reason: String| BakeError::Animation { reason };
+    let mut config =
+        webp::WebPConfig::new().map_err(|()| failed("no encoder configuration".into()))?;
+    config.quality = PREVIEW_QUALITY;
+    let mut encoder = webp::AnimEncoder::new(PREVIEW_PX, PREVIEW_PX, &config);
+    for (at, frame) in frames.iter().enumerate() {
+        let at_ms = at as i32 * PREVIEW_FRAME_MS;
+        encoder.add_frame(webp::AnimFrame::from_rgb(
+            frame,
+            frame.width(),
+            frame.height(),
+            at_ms,
+        ));
+    }
+    let encoded = encoder
+        .try_encode()
+        .map_err(|error| failed(format!("{error:?}")))?;
+    Ok(encoded.to_vec())
 }
 
 fn jpeg(image: &RgbImage) -> Result<Vec<u8>, BakeError> {

@@ -125,9 +125,9 @@ impl Recipe {
             } else {
                 EffectsChoice::Auto
             },
-            effects_steps: if paper { epochs(64) } else { 2500 },
+            effects_steps: if paper { epochs(64) } else { 2000 },
             effects_batch: 8192,
-            composition_steps: if paper { epochs(64) } else { 2500 },
+            composition_steps: if paper { epochs(64) } else { 1500 },
             batch: 4,
             patch: 64,
             ablate_effects: true,
@@ -191,7 +191,7 @@ fn invalid(message: String, hint: &str) -> BakeError {
     }
 }
 
-fn number<T: std::str::FromStr + PartialOrd + std::fmt::Display>(
+fn number<T: Copy + std::str::FromStr + PartialOrd + std::fmt::Display>(
     key: &str,
     value: &str,
     low: T,

@@ -323,7 +323,7 @@ impl Bake<'_> {
             let model = self.train_paper(session, Some(secs), "paper")?;
             others.push(Other {
                 method: "paper",
-                secs: self.paper_secs(session),
+                secs: paper_secs(session),
                 model,
             });
         }
@@ -391,14 +391,10 @@ impl Bake<'_> {
         });
         Ok(Trained {
             model,
-            secs: self.paper_secs(session),
+            secs: paper_secs(session),
             others: Vec::new(),
             plan,
         })
-    }
-
-    fn paper_secs(&self, session: &Session<'_>) -> f64 {
-        session.secs(PAPER_EFFECTS) + session.secs(PAPER_COMPOSITION)
     }
 
     fn train_paper(
@@ -448,4 +444,8 @@ impl Bake<'_> {
         model.composition = composition::restore(data, session, PAPER_COMPOSITION, true)?;
         Ok(model)
     }
+}
+
+fn paper_secs(session: &Session<'_>) -> f64 {
+    session.secs(PAPER_EFFECTS) + session.secs(PAPER_COMPOSITION)
 }

@@ -150,6 +150,9 @@ impl BlendComposition {
     }
 
     /// -> [B, 3, H, W], encoded sRGB, in [0, 1] up to the generated layer's small overshoot.
+    ///
+    /// # Panics
+    /// When the input's tensors do not have the shapes that [`BlendInput`] names.
     pub fn forward(&self, params: &Params, input: &BlendInput) -> Tensor {
         let base = input.prior_blend();
         let size = input.candidates.size();

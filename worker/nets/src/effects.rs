@@ -82,7 +82,7 @@ impl PointEffects {
         Self { layers }
     }
 
-    /// points, normals, to_viewer: [P, 3] in the normalised frame, the latter two unit -> effects [P, 3], linear
+    /// `points`, `normals`, `to_viewer`: [P, 3] in the normalised frame, the latter two unit -> effects [P, 3], linear
     /// light, not negative.
     pub fn forward(
         &self,

@@ -224,6 +224,7 @@ impl Params {
     }
 
     /// A copy whose flat buffer is `flat` (an average of weights, say); statistics come from `self`.
+    #[must_use]
     pub fn with_flat(&self, flat: &Tensor) -> Self {
         let flat = no_grad(|| flat * &self.trained + &self.flat * (1.0f64 - &self.trained));
         Self::from_flat(
@@ -330,7 +331,7 @@ mod tests {
     #[test]
     fn leaves_share_the_flat_buffer() {
         let (params, a, b) = two();
-        no_grad(|| params.flat().shallow_clone().fill_(2.0));
+        drop(no_grad(|| params.flat().shallow_clone().fill_(2.0)));
         assert!((params.get(a).sum(Kind::Float).double_value(&[]) - 12.0).abs() < 1e-6);
         assert!((params.get(b).sum(Kind::Float).double_value(&[]) - 6.0).abs() < 1e-6);
         assert_eq!(params.count(), 6);
@@ -349,7 +350,7 @@ mod tests {
         let (params, ..) = two();
         let saved = params.export();
         let (mut other, ..) = two();
-        no_grad(|| other.flat().shallow_clone().zero_());
+        drop(no_grad(|| other.flat().shallow_clone().zero_()));
         other
             .import(|name| {
                 saved

@@ -187,6 +187,9 @@ impl UNet {
     /// x: [B, input, H, W], any H and W -> [B, output, H, W] before the last activation.
     ///
     /// Sizes that the strides do not divide are padded with zeros at the right and bottom and cut again.
+    ///
+    /// # Panics
+    /// When `x` has not four dimensions.
     pub fn forward(&self, params: &Params, x: &Tensor, train: bool) -> Tensor {
         let (_, _, height, width) = x.size4().expect("a U-Net takes [B, C, H, W]");
         let step = 1i64 << self.levels;

@@ -1,0 +1,225 @@
+//! Whole bakes of tiny captures: the bundle renders what was scored, a resumed bake ends like an unbroken one, bad
+//! settings and hard captures end as they must.
+
+use std::cell::RefCell;
+use std::path::{Path, PathBuf};
+
+use ign_bake::{BakeJob, Event, Recipe, bake};
+use ign_bundle::Bundle;
+use ign_demo::DemoOptions;
+use ign_events::FailureKind;
+use ign_render::BundleRenderer;
+
+fn capture(dir: &Path, gloss: f64) -> PathBuf {
+    let out = dir.join("capture");
+    let options = DemoOptions {
+        gloss,
+        size: 48,
+        views: 14,
+        seed: 3,
+        ..DemoOptions::default()
+    };
+    ign_demo::generate(&out, &options, &|_, _| {}).expect("a demo capture");
+    out
+}
+
+fn recipe(settings: &[(&str, &str)]) -> Recipe {
+    let mut recipe = Recipe {
+        size: 40,
+        seed: 5,
+        ..Recipe::default()
+    };
+    let small = [
+        ("effects_steps", "12"),
+        ("composition_steps", "12"),
+        ("effects_batch", "512"),
+        ("batch", "2"),
+        ("references", "6"),
+    ];
+    for (key, value) in small.iter().chain(settings) {
+        recipe.settings.insert((*key).into(), (*value).into());
+    }
+    recipe
+}
+
+fn job(capture: &Path, work_dir: &Path, recipe: Recipe) -> BakeJob {
+    BakeJob {
+        capture_dir: capture.to_owned(),
+        capture_digest: format!("sha256:{}", "0".repeat(64)),
+        object: ("tests".into(), "vase".into()),
+        recipe,
+        checkpoint: None,
+        work_dir: work_dir.to_owned(),
+        threads: 1,
+    }
+}
+
+/// The weights files of a bundle, byte for byte.
+fn weights(bundle: &Path) -> Vec<Vec<u8>> {
+    [ign_bundle::EFFECTS_FILE, ign_bundle::COMPOSITION_FILE]
+        .iter()
+        .filter_map(|file| std::fs::read(bundle.join(file)).ok())
+        .collect()
+}
+
+#[test]
+fn a_bundle_renders_what_was_scored() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let capture = capture(dir.path(), 0.8);
+    for (name, preset, scale) in [
+        ("standard", "standard", "fp32"),
+        ("half", "standard", "fp16"),
+        ("paper", "paper", "fp32"),
+    ] {
+        let mut recipe = recipe(&[("effects", "on")]);
+        recipe.preset = serde_json::from_value(preset.into()).expect("a preset");
+        recipe
+            .settings
+            .insert("half_weights".into(), (scale == "fp16").to_string());
+        let folder = bake(&job(&capture, &dir.path().join(name), recipe), &|_| {}).expect("a bake");
+        let bundle = Bundle::open(&folder).expect("it verifies");
+        let metrics = bundle.metrics().expect("metrics").expect("metrics.json");
+        for method in ["n_ibr", "ibr", "ours"] {
+            assert!(
+                metrics
+                    .method(method)
+                    .is_some_and(|row| row.mse.is_finite()),
+                "{name}: {method}"
+            );
+        }
+        assert!(metrics.speed_error.len() >= 4);
+        let renderer = BundleRenderer::open(&folder, tch::Device::Cpu).expect("it opens");
+        let cameras = bundle.held_out_cameras().expect("cameras");
+        assert!(!cameras.is_empty());
+        for (view, camera) in cameras {
+            let file = folder.join(ign_bundle::held_out_file(&view, "ours"));
+            let scored = image::open(file).expect("an image").into_rgb8();
+            let rendered = renderer.render_normalised(&camera);
+            let worst = scored
+                .iter()
+                .zip(rendered.iter())
+                .map(|(a, b)| a.abs_diff(*b))
+                .max();
+            assert!(
+                worst <= Some(1),
+                "{name}, {view}: differs by {worst:?} of 255"
+            );
+        }
+    }
+}
+
+#[test]
+fn resuming_gives_what_an_unbroken_bake_gives() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let capture = capture(dir.path(), 0.8);
+    let recipe = recipe(&[("effects", "on"), ("checkpoint_secs", "0")]);
+    let kept = RefCell::new(Vec::new());
+    let whole = bake(
+        &job(&capture, &dir.path().join("whole"), recipe.clone()),
+        &|event| {
+            if let Event::Checkpoint { path } = event {
+                let copy = dir
+                    .path()
+                    .join(format!("kept-{}.safetensors", kept.borrow().len()));
+                std::fs::copy(path, &copy).expect("a copy");
+                kept.borrow_mut().push(copy);
+            }
+        },
+    )
+    .expect("a bake");
+    let kept = kept.into_inner();
+    assert!(kept.len() > 20, "{} checkpoints", kept.len());
+    // In the middle of the effects, and of the composition.
+    for at in [5, 20] {
+        let mut job = job(
+            &capture,
+            &dir.path().join(format!("resumed-{at}")),
+            recipe.clone(),
+        );
+        job.checkpoint = Some(kept[at].clone());
+        let resumed = bake(&job, &|_| {}).expect("a resumed bake");
+        assert!(
+            weights(&resumed) == weights(&whole),
+            "resumed from checkpoint {at}: other weights"
+        );
+    }
+}
+
+#[test]
+fn a_checkpoint_of_another_recipe_is_refused() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let capture = capture(dir.path(), 0.0);
+    let last = RefCell::new(None);
+    let first = recipe(&[("effects", "off")]);
+    bake(&job(&capture, &dir.path().join("one"), first), &|event| {
+        if let Event::Checkpoint { path } = event {
+            *last.borrow_mut() = Some(path);
+        }
+    })
+    .expect("a bake");
+    let mut other = job(
+        &capture,
+        &dir.path().join("two"),
+        recipe(&[("effects", "off"), ("k", "3")]),
+    );
+    other.checkpoint = last.into_inner();
+    let error = bake(&other, &|_| {}).expect_err("another recipe");
+    assert!(error.to_string().contains("another recipe"), "{error}");
+}
+
+#[test]
+fn bad_settings_and_captures_are_the_submitters_fault() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let capture = capture(dir.path(), 0.0);
+    let unknown = job(
+        &capture,
+        &dir.path().join("a"),
+        recipe(&[("colour", "blue")]),
+    );
+    let empty = dir.path().join("empty");
+    std::fs::create_dir(&empty).expect("a folder");
+    for job in [unknown, job(&empty, &dir.path().join("b"), recipe(&[]))] {
+        let failure = bake(&job, &|_| {}).expect_err("cannot be baked").failure();
+        assert_eq!(failure.kind, FailureKind::InvalidInput);
+        assert!(
+            !failure.message.is_empty() && !failure.hint.is_empty(),
+            "{failure:?}"
+        );
+    }
+}
+
+/// Few references, few views, black and saturated photographs: every figure stays finite.
+#[test]
+fn hard_captures_bake_with_finite_figures() {
+    let dir = tempfile::tempdir().expect("a folder");
+    for (name, fill) in [("black", Some(0u8)), ("white", Some(255)), ("few", None)] {
+        let folder = dir.path().join(name);
+        std::fs::create_dir(&folder).expect("a folder");
+        let capture = capture(&folder, 0.5);
+        if let Some(value) = fill {
+            for entry in std::fs::read_dir(capture.join("images")).expect("images") {
+                let path = entry.expect("an entry").path();
+                let mut image = image::open(&path).expect("an image").into_rgb8();
+                image.pixels_mut().for_each(|pixel| pixel.0 = [value; 3]);
+                image.save(&path).expect("written");
+            }
+        }
+        let recipe = recipe(&[
+            ("references", if name == "few" { "2" } else { "6" }),
+            ("effects", "on"),
+        ]);
+        let bundle = bake(&job(&capture, &folder.join("work"), recipe), &|_| {}).expect("a bake");
+        let metrics = Bundle::open(&bundle)
+            .expect("it verifies")
+            .metrics()
+            .expect("metrics")
+            .expect("there");
+        for row in &metrics.methods {
+            assert!(
+                row.mse.is_finite() && row.mse_object.is_finite() && row.psnr.is_finite(),
+                "{name}: {}",
+                row.name
+            );
+        }
+    }
+}
