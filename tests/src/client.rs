@@ -84,6 +84,7 @@ impl Client {
     pub fn command(&self, args: &[&str]) -> Result<Command> {
         let mut command = Command::new(program("ignctl")?);
         command.args(&self.connection).args(args);
+        command.env("IGN_WORKER", program("ign-worker")?);
         for name in ["IGN_SERVER", "IGN_TOKEN_FILE", "IGN_DATA"] {
             command.env_remove(name);
         }

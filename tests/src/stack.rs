@@ -279,7 +279,10 @@ fn start_embedded(data: &Path, workers: usize) -> Result<Process> {
             "--threads",
             "1",
         ],
-        [],
+        [(
+            "IGN_WORKER".to_owned(),
+            path(&program("ign-worker")?)?.to_owned(),
+        )],
         &data.with_extension("log"),
     )
 }
