@@ -22,7 +22,7 @@ use crate::problem::{Doing as _, Problem, chain};
 #[derive(Clone, Debug, Default, clap::Args)]
 #[command(next_help_heading = "Connection")]
 pub(crate) struct ConnectionArgs {
-    /// Coordinator to use, such as http://bakery.local:7070; without it, the one of the data folder
+    /// Coordinator to use, such as <http://bakery.local:7070>; without it, the one of the data folder
     #[arg(
         long,
         env = "IGN_SERVER",
@@ -40,9 +40,9 @@ pub(crate) struct ConnectionArgs {
         hide_env_values = true
     )]
     pub(crate) token_file: Option<PathBuf>,
-    /// Data folder of the service on this machine [default: $XDG_DATA_HOME/ign or ~/.local/share/ign]
     #[arg(
         long,
+        help = "Data folder of the service on this machine [default: $XDG_DATA_HOME/ign or ~/.local/share/ign]",
         env = "IGN_DATA",
         global = true,
         value_name = "DIR",
@@ -198,7 +198,7 @@ impl Connection {
     pub(crate) async fn to(target: Target) -> Result<Self, Problem> {
         let http = reqwest::Client::builder()
             .connect_timeout(Duration::from_secs(5))
-            .read_timeout(Duration::from_secs(60))
+            .read_timeout(Duration::from_mins(1))
             .build()
             .doing("cannot set up HTTP", &target.url)?;
         let health = target

@@ -1,4 +1,4 @@
-//! The service on one machine: a coordinator in this process on SQLite and local files, and workers as children.
+//! The service on one machine: a coordinator in this process on `SQLite` and local files, and workers as children.
 //!
 //! Invariant: one service per data folder. The folder's `lock` is held from before the database is opened until after
 //! the last worker ended; the system releases it should this process die.
@@ -7,13 +7,17 @@ use std::fs::{File, TryLockError};
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::time::Duration;
 
+use ign_coordinator::Running;
+use ign_registry::StoreConfig;
 use tokio::sync::{oneshot, watch};
 use tokio::task::{JoinHandle, JoinSet};
+use tracing_subscriber::EnvFilter;
 
-use crate::connection::{EndpointFile, Target};
-use crate::problem::{Doing as _, Problem};
+use crate::connection::Target;
+use crate::problem::{Doing as _, Problem, chain};
 use crate::supervise::{self, WorkerCommand};
 
 /// How to start the service.
@@ -24,8 +28,8 @@ pub(crate) struct Options {
     /// Threads per worker; none to share the cores among the workers.
     pub(crate) threads: Option<usize>,
     pub(crate) listen: SocketAddr,
-    /// Whether workers that keep dying end the service.
-    pub(crate) give_up: bool,
+    /// Whether this is a bake's own service: workers that keep dying end it, and the coordinator logs to a file.
+    pub(crate) own: bool,
 }
 
 /// A service that runs in this process.
@@ -48,6 +52,7 @@ impl Embedded {
         let logs = data.join("logs");
         std::fs::create_dir_all(&logs).doing("cannot create the data folder", data.display())?;
         let lock = take_lock(&data)?;
+        log(options.own.then(|| logs.join("coordinator.log")).as_deref())?;
         let program = match options.workers {
             0 => PathBuf::new(),
             _ => supervise::find_worker()?,
@@ -57,12 +62,13 @@ impl Embedded {
         remove_if_there(&data.join("endpoint.json"))?;
 
         let (stop_coordinator, stopped) = oneshot::channel();
-        let mut coordinator = tokio::spawn(serve(data.clone(), options.listen, stopped));
-        let endpoint = tokio::select! {
-            ended = &mut coordinator => return Err(ended_early(ended)),
-            endpoint = listening(&data) => endpoint?,
-        };
-        let target = Target::new(&endpoint.url, Some(&token_file))?;
+        let running = start_coordinator(&data, &token_file, options.listen, stopped).await?;
+        let url = running.url();
+        let coordinator = tokio::spawn(async move {
+            let ended = running.wait().await;
+            ended.map_err(|error| Problem::failed(chain(&error)))
+        });
+        let target = Target::new(&url, Some(&token_file))?;
 
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = options
@@ -77,7 +83,7 @@ impl Embedded {
             let args = [
                 "agent",
                 "--server",
-                &endpoint.url,
+                &url,
                 "--token-file",
                 &token_file.display().to_string(),
                 "--work-dir",
@@ -95,7 +101,7 @@ impl Embedded {
                 args,
                 log: logs.join(format!("{name}.log")),
                 name,
-                give_up_after: options.give_up.then_some(supervise::HOPELESS_AFTER),
+                give_up_after: options.own.then_some(supervise::HOPELESS_AFTER),
             };
             workers.spawn(supervise::keep_running(command, stopped.clone()));
         }
@@ -144,9 +150,8 @@ impl Embedded {
             match tokio::time::timeout(Duration::from_secs(10), &mut self.coordinator).await {
                 Ok(Ok(ended)) => outcome = outcome.and(ended),
                 Ok(Err(error)) => {
-                    outcome = outcome.and(Err(Problem::failed(format!(
-                        "the coordinator stopped: {error}"
-                    ))))
+                    let stopped = Problem::failed(format!("the coordinator stopped: {error}"));
+                    outcome = outcome.and(Err(stopped));
                 }
                 // Streams that clients keep open must not keep the service.
                 Err(_) => self.coordinator.abort(),
@@ -164,24 +169,54 @@ fn ended_early(ended: Result<Result<(), Problem>, tokio::task::JoinError>) -> Pr
     }
 }
 
-async fn serve(
-    data: PathBuf,
+/// Starts the coordinator on the data folder; returns when it listens.
+async fn start_coordinator(
+    data: &Path,
+    token_file: &Path,
     listen: SocketAddr,
     stopped: oneshot::Receiver<()>,
-) -> Result<(), Problem> {
-    let _ = (data, listen, stopped);
-    Err(Problem::failed("PLACEHOLDER"))
+) -> Result<Running, Problem> {
+    let text = |path: &Path| {
+        path.to_str()
+            .map(str::to_string)
+            .ok_or_else(|| Problem::usage("the data folder's path is not UTF-8").at(data.display()))
+    };
+    // The part of a database URL that is a path is percent-encoded; the store's is not.
+    let database = text(&data.join("ign.db"))?
+        .replace('%', "%25")
+        .replace('?', "%3F");
+    let config = ign_coordinator::Config {
+        listen,
+        database: format!("sqlite://{database}"),
+        store: StoreConfig::new(format!("file://{}", text(&data.join("store"))?)),
+        token_file: token_file.to_path_buf(),
+        endpoint_file: Some(data.join("endpoint.json")),
+        settings: Default::default(),
+        redirect_blobs: false,
+    };
+    let shutdown = async {
+        // Asked to stop, or the service was dropped: both mean stop.
+        let _either = stopped.await;
+    };
+    Box::pin(ign_coordinator::serve(config, shutdown))
+        .await
+        .map_err(|error| Problem::failed(chain(&error)).at(data.display()))
 }
 
-/// Waits until `endpoint.json` says where the coordinator listens.
-async fn listening(data: &Path) -> Result<EndpointFile, Problem> {
-    for _ in 0..600 {
-        if let Some(endpoint) = EndpointFile::of_live_service(data) {
-            return Ok(endpoint);
-        }
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-    Err(Problem::failed("the coordinator did not start listening within 30 s").at(data.display()))
+/// Sends the coordinator's log to a file, or to stderr; `IGN_LOG` sets the level.
+fn log(file: Option<&Path>) -> Result<(), Problem> {
+    let level = if file.is_some() { "info" } else { "warn" };
+    let filter = EnvFilter::try_from_env("IGN_LOG").unwrap_or_else(|_unset| EnvFilter::new(level));
+    let log = tracing_subscriber::fmt()
+        .with_ansi(false)
+        .with_env_filter(filter);
+    let begun = match file {
+        Some(path) => log
+            .with_writer(Mutex::new(supervise::open_log(path)?))
+            .try_init(),
+        None => log.with_writer(std::io::stderr).try_init(),
+    };
+    begun.map_err(|error| Problem::failed(format!("cannot begin the log: {error}")))
 }
 
 fn take_lock(data: &Path) -> Result<File, Problem> {

@@ -4,11 +4,7 @@
 //! terminal there is no escape sequence and no line that rewrites itself; table cells never hold control
 //! characters, because names and messages come from other people's files.
 
-#![expect(
-    clippy::print_stdout,
-    clippy::print_stderr,
-    reason = "the one place that prints"
-)]
+#![expect(clippy::print_stderr, reason = "the one place that prints")]
 
 use std::io::{IsTerminal as _, Write as _};
 use std::time::Duration;
@@ -111,7 +107,8 @@ pub(crate) fn screen(text: &str) -> Result<(), Problem> {
     let lines: Vec<&str> = text.lines().collect();
     for (index, line) in lines.iter().take(rows - 1).enumerate() {
         if index == rows - 2 && lines.len() > rows - 1 {
-            out.push_str(&format!("({} more lines)\x1b[K\n", lines.len() - index));
+            let more = format!("({} more lines)\x1b[K\n", lines.len() - index);
+            out.push_str(&more);
         } else {
             out.push_str(line);
             out.push_str("\x1b[K\n");
@@ -158,9 +155,8 @@ impl Table {
     }
 
     /// Adds a row; it has as many cells as the header.
-    pub(crate) fn row(&mut self, cells: Vec<String>) {
-        self.rows
-            .push(cells.iter().map(|cell| printable(cell)).collect());
+    pub(crate) fn row<const N: usize>(&mut self, cells: [String; N]) {
+        self.rows.push(cells.map(|cell| printable(&cell)).to_vec());
     }
 
     /// The table as text, each line ended; for a terminal of `columns` if given.
@@ -237,11 +233,12 @@ pub(crate) fn pairs(pairs: &[(&str, String)]) -> String {
         .map(|(name, _)| name.len())
         .max()
         .unwrap_or(0);
-    pairs
+    let lines: Vec<String> = pairs
         .iter()
         .filter(|(_, value)| !value.is_empty())
         .map(|(name, value)| format!("{name:width$}  {}\n", printable(value)))
-        .collect()
+        .collect();
+    lines.concat()
 }
 
 /// `1h 04m`, `3m 20s`, `12s`: two units at most.
@@ -415,8 +412,8 @@ mod tests {
 
     fn table() -> Table {
         let mut table = Table::new(&["JOB", ">MSE", "WHY"]);
-        table.row(vec!["0a1b".into(), "4.9".into(), "a\nb\x1b[31mred".into()]);
-        table.row(vec!["0a1b2c3d".into(), "121".into(), "mesh missing".into()]);
+        table.row(["0a1b".into(), "4.9".into(), "a\nb\x1b[31mred".into()]);
+        table.row(["0a1b2c3d".into(), "121".into(), "mesh missing".into()]);
         table
     }
 

@@ -65,7 +65,7 @@ impl RecipeArgs {
         for (key, value) in &self.set {
             match key.as_str() {
                 "crop" if matches!(value.as_str(), "object" | "none") => {
-                    recipe.crop.clone_from(value)
+                    recipe.crop.clone_from(value);
                 }
                 "crop" => {
                     return Err(Problem::usage(format!("crop is {value:?}"))

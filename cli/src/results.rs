@@ -275,7 +275,7 @@ pub(crate) fn method_table(methods: &[MethodView]) -> String {
     let cell =
         |value: Option<f64>| value.map_or_else(|| "-".to_string(), |value| format!("{value:.2}"));
     for row in methods {
-        table.row(vec![
+        table.row([
             row.method.clone(),
             cell(row.mse),
             cell(row.mse_object),

@@ -3,6 +3,7 @@
 //! Each child ends when its stdin closes, so no worker outlives ignctl, however ignctl ends. A worker that dies is
 //! started again, after a wait that grows while it keeps dying at once.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
@@ -111,16 +112,21 @@ pub(crate) async fn keep_running(
     }
 }
 
-fn start(command: &WorkerCommand) -> Result<Child, Problem> {
-    if std::fs::metadata(&command.log).is_ok_and(|meta| meta.len() > LOG_BYTES) {
-        std::fs::rename(&command.log, command.log.with_extension("log.old"))
-            .doing("cannot rotate", command.log.display())?;
+/// Opens a log to be added to; a large one is set aside first.
+pub(crate) fn open_log(path: &Path) -> Result<File, Problem> {
+    if std::fs::metadata(path).is_ok_and(|meta| meta.len() > LOG_BYTES) {
+        std::fs::rename(path, path.with_extension("log.old"))
+            .doing("cannot rotate", path.display())?;
     }
-    let log = std::fs::OpenOptions::new()
+    File::options()
         .create(true)
         .append(true)
-        .open(&command.log)
-        .doing("cannot write", command.log.display())?;
+        .open(path)
+        .doing("cannot write", path.display())
+}
+
+fn start(command: &WorkerCommand) -> Result<Child, Problem> {
+    let log = open_log(&command.log)?;
     let out = log
         .try_clone()
         .doing("cannot write", command.log.display())?;

@@ -247,14 +247,16 @@ impl JobView {
 impl ProgressView {
     /// `composition 41%, eta 1m 20s, mse 7.40`.
     pub(crate) fn one_line(&self) -> String {
-        let mut text = format!("{} {:.0}%", self.stage, self.percent);
-        if let Some(eta_secs) = self.eta_secs {
-            text.push_str(&format!(", eta {}", duration(eta_secs)));
-        }
-        if let Some(mse) = self.mse {
-            text.push_str(&format!(", mse {}", number(mse)));
-        }
-        text
+        let done = format!("{} {:.0}%", self.stage, self.percent);
+        let eta = self
+            .eta_secs
+            .map(|eta_secs| format!("eta {}", duration(eta_secs)));
+        let mse = self.mse.map(|mse| format!("mse {}", number(mse)));
+        [Some(done), eta, mse]
+            .into_iter()
+            .flatten()
+            .collect::<Vec<_>>()
+            .join(", ")
     }
 }
 
@@ -276,15 +278,16 @@ impl BundleView {
 
     /// `v3 (latest)  12.3 MB  mse 4.90`.
     pub(crate) fn summary(&self) -> String {
-        let mut text = format!("v{}", self.version);
-        if !self.aliases.is_empty() {
-            text.push_str(&format!(" ({})", self.aliases.join(", ")));
-        }
-        text.push_str(&format!(", {}", bytes(self.size_bytes)));
-        if let Some(mse) = self.mse() {
-            text.push_str(&format!(", mse {}", number(mse)));
-        }
-        text
+        let version = match self.aliases.join(", ") {
+            aliases if aliases.is_empty() => format!("v{}", self.version),
+            aliases => format!("v{} ({aliases})", self.version),
+        };
+        let mse = self.mse().map(|mse| format!("mse {}", number(mse)));
+        [Some(version), Some(bytes(self.size_bytes)), mse]
+            .into_iter()
+            .flatten()
+            .collect::<Vec<_>>()
+            .join(", ")
     }
 
     /// Held-out MSE of our method, from the summary kept with the version: either the method's row of a
@@ -345,7 +348,7 @@ pub(crate) fn job_table(jobs: &[JobView], now: DateTime<Utc>) -> String {
         "JOB", "OBJECT", "STATE", ">ATTEMPT", ">AGE", ">TOOK", "NOTE",
     ]);
     for job in jobs {
-        table.row(vec![
+        table.row([
             ids.show(&job.id),
             job.name(),
             job.state_for_people().to_string(),
@@ -362,11 +365,11 @@ pub(crate) fn job_table(jobs: &[JobView], now: DateTime<Utc>) -> String {
 pub(crate) mod samples {
     use super::*;
 
-    fn stamp(seconds: i64) -> Option<prost_types::Timestamp> {
-        Some(prost_types::Timestamp {
+    fn stamp(seconds: i64) -> prost_types::Timestamp {
+        prost_types::Timestamp {
             seconds: 1_800_000_000 + seconds,
             nanos: 0,
-        })
+        }
     }
 
     pub(crate) fn now() -> DateTime<Utc> {
@@ -390,7 +393,7 @@ pub(crate) mod samples {
             state: state.into(),
             attempt: 1,
             max_attempts: 3,
-            submitted_at: stamp(0),
+            submitted_at: Some(stamp(0)),
             ..Default::default()
         }
     }
@@ -405,7 +408,7 @@ pub(crate) mod samples {
                 error: Some(7.4),
                 message: "epoch 5 of 12".into(),
             }),
-            started_at: stamp(30),
+            started_at: Some(stamp(30)),
             ..job(
                 "01985a4e-0001-7000-8000-000000000001",
                 "vase",
@@ -422,8 +425,8 @@ pub(crate) mod samples {
                 at: "sparse/0/cameras.txt:7".into(),
                 hint: "re-export with PINHOLE".into(),
             }),
-            started_at: stamp(30),
-            finished_at: stamp(33),
+            started_at: Some(stamp(30)),
+            finished_at: Some(stamp(33)),
             ..job(
                 "01985a4e-0002-7000-8000-000000000002",
                 "bust",
@@ -435,8 +438,8 @@ pub(crate) mod samples {
     pub(crate) fn succeeded() -> v1::Job {
         v1::Job {
             bundle: Some(bundle()),
-            started_at: stamp(30),
-            finished_at: stamp(500),
+            started_at: Some(stamp(30)),
+            finished_at: Some(stamp(500)),
             ..job(
                 "01985a4e-0003-7000-8000-000000000003",
                 "axe",
@@ -454,7 +457,7 @@ pub(crate) mod samples {
             version: 2,
             manifest_digest: format!("sha256:{}", "cd".repeat(32)),
             aliases: vec!["latest".into()],
-            created_at: stamp(500),
+            created_at: Some(stamp(500)),
             size_bytes: 12_300_000,
             job_id: "01985a4e-0003-7000-8000-000000000003".into(),
             metrics_json: r#"{"methods":[{"name":"ours","mse":4.9}]}"#.into(),

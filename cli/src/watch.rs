@@ -10,7 +10,7 @@ use crate::problem::Problem;
 use crate::views::{JobView, is_terminal, short_id};
 
 /// How long a coordinator may be away before following is given up; the job itself does not mind.
-const PATIENCE: Duration = Duration::from_secs(120);
+const PATIENCE: Duration = Duration::from_mins(2);
 
 /// Follows a job until it ends; `changed` sees each state of it.
 pub(crate) async fn until_end(

@@ -132,17 +132,12 @@ async fn list(context: &Context, of: Option<&str>, include_retired: bool) -> Res
         None => (String::new(), String::new()),
         Some(of) => {
             let usage = |error: ign_proto::IdError| Problem::usage(error.to_string());
-            match of.split_once('/') {
-                None => (
-                    of.parse::<ign_proto::CollectionId>()
-                        .map_err(usage)?
-                        .to_string(),
-                    String::new(),
-                ),
-                Some(_) => {
-                    let name: ObjectName = of.parse().map_err(usage)?;
-                    (name.collection.to_string(), name.object.to_string())
-                }
+            if of.contains('/') {
+                let name: ObjectName = of.parse().map_err(usage)?;
+                (name.collection.to_string(), name.object.to_string())
+            } else {
+                let collection: ign_proto::CollectionId = of.parse().map_err(usage)?;
+                (collection.to_string(), String::new())
             }
         }
     };
@@ -179,7 +174,7 @@ fn table(bundles: &[BundleView]) -> String {
             bundle.version,
             if bundle.retired { " (retired)" } else { "" }
         );
-        table.row(vec![
+        table.row([
             bundle.name(),
             version,
             bundle.aliases.join(","),

@@ -268,23 +268,21 @@ async fn worker() -> Check {
 fn table(checks: &[Check]) -> String {
     let mut table = Table::new(&["CHECK", "STATE", "DETAIL"]);
     for check in checks {
-        table.row(vec![
+        table.row([
             check.name.to_string(),
             check.state.to_string(),
             check.detail.clone(),
         ]);
     }
-    let mut text = table.to_string();
-    for check in checks {
-        if let Some(hint) = &check.hint {
-            text.push_str(&format!(
-                "hint ({}): {}\n",
-                check.name,
-                output::printable(hint)
-            ));
-        }
-    }
-    text
+    let hints = checks.iter().filter_map(|check| {
+        let hint = check.hint.as_deref()?;
+        Some(format!(
+            "hint ({}): {}\n",
+            check.name,
+            output::printable(hint)
+        ))
+    });
+    std::iter::once(table.to_string()).chain(hints).collect()
 }
 
 #[cfg(test)]

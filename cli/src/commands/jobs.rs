@@ -14,7 +14,7 @@ use serde::Serialize;
 use crate::Context;
 use crate::connection::Connection;
 use crate::output::{self, Format, Live};
-use crate::problem::{Exit, Problem};
+use crate::problem::Problem;
 use crate::views::{JobView, is_terminal, job_table, short_id, time};
 use crate::watch;
 
@@ -208,7 +208,7 @@ fn details(job: &JobView, now: DateTime<Utc>) -> String {
             "progress",
             job.progress
                 .as_ref()
-                .map(|p| p.one_line())
+                .map(crate::views::ProgressView::one_line)
                 .unwrap_or_default(),
         ),
         (
@@ -531,6 +531,7 @@ pub(crate) async fn wait_for(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::problem::Exit;
     use crate::views::samples;
 
     #[test]

@@ -86,9 +86,7 @@ fn view(server: &str, status: &v1::StatusResponse) -> StatusView {
         .iter()
         .map(|state| ((*state).to_string(), 0))
         .collect();
-    for (state, count) in &status.jobs_by_state {
-        jobs_by_state.insert(state.clone(), *count);
-    }
+    jobs_by_state.extend(status.jobs_by_state.clone());
     StatusView {
         server: server.trim_end_matches('/').to_string(),
         server_version: status.server_version.clone(),
@@ -132,40 +130,40 @@ fn screen(view: &StatusView) -> String {
     section(
         &mut text,
         "RUNNING",
-        &running(&view.running, &ids),
+        running(&view.running, &ids).as_ref(),
         "nothing runs",
     );
     section(
         &mut text,
         "WORKERS",
-        &workers(&view.workers, &ids, now),
+        workers(&view.workers, &ids, now).as_ref(),
         "no worker is connected",
     );
     if !view.next_queued.is_empty() {
-        section(&mut text, "NEXT", &queued(&view.next_queued, &ids, now), "");
+        section(
+            &mut text,
+            "NEXT",
+            Some(&queued(&view.next_queued, &ids, now)),
+            "",
+        );
     }
     if !view.recent_failures.is_empty() {
         section(
             &mut text,
             "FAILED",
-            &failures(&view.recent_failures, &ids, now),
+            Some(&failures(&view.recent_failures, &ids, now)),
             "",
         );
     }
     text
 }
 
-fn section(text: &mut String, name: &str, table: &Option<Table>, empty: &str) {
+fn section(text: &mut String, name: &str, table: Option<&Table>, empty: &str) {
     text.push('\n');
     text.push_str(&output::heading(name));
     text.push('\n');
-    match table {
-        Some(table) => text.push_str(&table.to_string()),
-        None => {
-            text.push_str(empty);
-            text.push('\n');
-        }
-    }
+    let table = table.map_or_else(|| format!("{empty}\n"), Table::to_string);
+    text.push_str(&table);
 }
 
 fn running(jobs: &[JobView], ids: &ShortIds) -> Option<Table> {
@@ -177,7 +175,7 @@ fn running(jobs: &[JobView], ids: &ShortIds) -> Option<Table> {
         let figure = |value: Option<f64>, show: fn(f64) -> String| {
             value.map_or_else(|| "-".to_string(), show)
         };
-        table.row(vec![
+        table.row([
             ids.show(&job.id),
             job.name(),
             progress.map_or_else(|| "starting".to_string(), |p| p.stage.clone()),
@@ -201,7 +199,7 @@ fn workers(workers: &[WorkerView], ids: &ShortIds, now: DateTime<Utc>) -> Option
             (None, true) => "draining".to_string(),
             (None, false) => "idle".to_string(),
         };
-        table.row(vec![
+        table.row([
             worker.id.clone(),
             worker.hostname.clone(),
             age(worker.last_seen_at, now),
@@ -213,10 +211,10 @@ fn workers(workers: &[WorkerView], ids: &ShortIds, now: DateTime<Utc>) -> Option
     (!workers.is_empty()).then_some(table)
 }
 
-fn queued(jobs: &[JobView], ids: &ShortIds, now: DateTime<Utc>) -> Option<Table> {
+fn queued(jobs: &[JobView], ids: &ShortIds, now: DateTime<Utc>) -> Table {
     let mut table = Table::new(&["JOB", "OBJECT", ">PRIORITY", ">WAITED", "WAITING FOR"]);
     for job in jobs {
-        table.row(vec![
+        table.row([
             ids.show(&job.id),
             job.name(),
             job.priority.to_string(),
@@ -224,13 +222,13 @@ fn queued(jobs: &[JobView], ids: &ShortIds, now: DateTime<Utc>) -> Option<Table>
             job.waiting_for.clone().unwrap_or_default(),
         ]);
     }
-    Some(table)
+    table
 }
 
-fn failures(jobs: &[JobView], ids: &ShortIds, now: DateTime<Utc>) -> Option<Table> {
+fn failures(jobs: &[JobView], ids: &ShortIds, now: DateTime<Utc>) -> Table {
     let mut table = Table::new(&["JOB", "OBJECT", ">AGO", ">TRY", "KIND", "WHY"]);
     for job in jobs {
-        table.row(vec![
+        table.row([
             ids.show(&job.id),
             job.name(),
             age(job.finished_at, now),
@@ -242,7 +240,7 @@ fn failures(jobs: &[JobView], ids: &ShortIds, now: DateTime<Utc>) -> Option<Tabl
             job.note(),
         ]);
     }
-    Some(table)
+    table
 }
 
 #[cfg(test)]

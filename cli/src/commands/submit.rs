@@ -376,7 +376,7 @@ fn table(rows: &[RowView]) -> String {
     let mut table = Table::new(&["CAPTURE", "OBJECT", "OUTCOME", "JOB", "STATE", "NOTE"]);
     for row in rows {
         let job = row.job.as_ref();
-        table.row(vec![
+        table.row([
             row.path.display().to_string(),
             format!("{}/{}", row.collection, row.object),
             row.outcome.to_string(),
@@ -465,7 +465,7 @@ fn check_table(checks: &[CheckView]) -> String {
     let figure =
         |value: Option<usize>| value.map_or_else(|| "-".to_string(), |value| value.to_string());
     for check in checks {
-        table.row(vec![
+        table.row([
             check.path.display().to_string(),
             format!("{}/{}", check.collection, check.object),
             if check.ok { "ok" } else { "failed" }.to_string(),
@@ -475,29 +475,33 @@ fn check_table(checks: &[CheckView]) -> String {
             count(check, Severity::Warning).to_string(),
         ]);
     }
-    let mut text = table.to_string();
-    for check in checks.iter().filter(|check| !check.faults.is_empty()) {
-        text.push_str(&format!(
-            "\n{}\n",
-            output::printable(&check.path.display().to_string())
-        ));
-        for fault in &check.faults {
-            let label = match fault.severity {
-                Severity::Error => "error",
-                Severity::Warning => "warning",
-            };
-            for (label, line) in [
-                (label, &fault.message),
-                ("at", &fault.at),
-                ("hint", &fault.hint),
-            ] {
-                if !line.is_empty() {
-                    text.push_str(&format!("  {label:>7}: {}\n", output::printable(line)));
-                }
-            }
-        }
-    }
-    text
+    let faults = checks
+        .iter()
+        .filter(|check| !check.faults.is_empty())
+        .map(fault_list);
+    std::iter::once(table.to_string()).chain(faults).collect()
+}
+
+fn fault_list(check: &CheckView) -> String {
+    let lines = check.faults.iter().flat_map(|fault| {
+        let label = match fault.severity {
+            Severity::Error => "error",
+            Severity::Warning => "warning",
+        };
+        [
+            (label, &fault.message),
+            ("at", &fault.at),
+            ("hint", &fault.hint),
+        ]
+        .into_iter()
+        .filter(|(_, line)| !line.is_empty())
+        .map(|(label, line)| format!("  {label:>7}: {}", output::printable(line)))
+    });
+    let capture = output::printable(&check.path.display().to_string());
+    let lines: Vec<String> = std::iter::once(format!("\n{capture}"))
+        .chain(lines)
+        .collect();
+    lines.join("\n") + "\n"
 }
 
 #[cfg(test)]

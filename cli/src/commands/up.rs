@@ -36,20 +36,12 @@ fn threads(text: &str) -> Result<usize, String> {
 }
 
 pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
-    tracing_subscriber::fmt()
-        .with_writer(std::io::stderr)
-        .with_ansi(false)
-        .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_default_env()
-                .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn")),
-        )
-        .init();
     let options = Options {
         data: context.connection.data_dir()?,
         workers: args.workers,
         threads: args.threads,
         listen: args.listen,
-        give_up: false,
+        own: false,
     };
     let mut service = Embedded::start(&options).await?;
     if !args.listen.ip().is_loopback() {

@@ -15,6 +15,13 @@ use ign_proto::v1;
 use serde_json::Value;
 use worker::FakeWorker;
 
+fn in_background(work: impl FnOnce() + Send + 'static) -> std::thread::JoinHandle<()> {
+    std::thread::Builder::new()
+        .name("worker".into())
+        .spawn(work)
+        .unwrap()
+}
+
 fn json(output: &std::process::Output) -> Value {
     serde_json::from_slice(&output.stdout)
         .unwrap_or_else(|error| panic!("{error}: {} {}", stdout(output), stderr(output)))
@@ -207,7 +214,7 @@ fn a_bake_ends_with_everything_in_its_folder() {
     let dir = capture(work.path(), "vase");
     let out = work.path().join("out");
     let worker = FakeWorker::new(&service);
-    let baker = std::thread::spawn(move || {
+    let baker = in_background(move || {
         worker.run_one(|worker, lease| async move {
             worker.progress(&lease, "composition", 41.0).await;
             worker.log(&lease, "info", "epoch 5 of 12").await;
@@ -315,7 +322,7 @@ fn a_failed_bake_says_what_where_and_how_to_fix_it() {
     let empty = work.path().join("empty");
     std::fs::create_dir(&empty).unwrap();
     let worker = FakeWorker::new(&service);
-    let baker = std::thread::spawn(move || {
+    let baker = in_background(move || {
         worker.run_one(|worker, lease| async move {
             let failure = v1::Failure {
                 kind: v1::FailureKind::InvalidInput.into(),

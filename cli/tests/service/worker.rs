@@ -5,10 +5,10 @@ use std::path::Path;
 use glam::{DAffine3, DVec3};
 use ign_bundle::{BundleWriter, Metrics, Reference};
 use ign_geometry::{Camera, CameraIntrinsics, Mesh, Similarity};
+use ign_proto::Digest;
 use ign_proto::v1;
 use ign_proto::v1::workers_client::WorkersClient;
 use serde_json::json;
-use sha2::{Digest as _, Sha256};
 use tonic::Request;
 use tonic::metadata::MetadataValue;
 use tonic::transport::Channel;
@@ -74,12 +74,12 @@ impl FakeWorker {
         panic!("no job to lease");
     }
 
-    fn attempt(lease: &v1::Lease) -> Option<v1::JobAttempt> {
-        Some(v1::JobAttempt {
+    fn attempt(lease: &v1::Lease) -> v1::JobAttempt {
+        v1::JobAttempt {
             job_id: lease.job_id.clone(),
             attempt: lease.attempt,
             worker_id: NAME.into(),
-        })
+        }
     }
 
     async fn heartbeat(
@@ -89,7 +89,7 @@ impl FakeWorker {
         logs: Vec<v1::LogLine>,
     ) {
         let request = v1::HeartbeatRequest {
-            job: Self::attempt(lease),
+            job: Some(Self::attempt(lease)),
             progress,
             logs,
         };
@@ -129,7 +129,7 @@ impl FakeWorker {
 
     pub(crate) async fn fail(&self, lease: &v1::Lease, failure: v1::Failure) {
         let request = v1::FailRequest {
-            job: Self::attempt(lease),
+            job: Some(Self::attempt(lease)),
             failure: Some(failure),
             logs: Vec::new(),
         };
@@ -161,7 +161,7 @@ impl FakeWorker {
                 .to_str()
                 .unwrap()
                 .to_string();
-            let digest = format!("sha256:{}", hex(&Sha256::digest(&bytes)));
+            let digest = Digest::of(&bytes).to_string();
             let repository = format!("{}/v2/{}/{}", self.url, object.collection, object.object);
             let answer = http
                 .post(format!("{repository}/blobs/uploads/?digest={digest}"))
@@ -183,7 +183,7 @@ impl FakeWorker {
             });
         }
         let request = v1::CompleteRequest {
-            job: Self::attempt(lease),
+            job: Some(Self::attempt(lease)),
             files,
             metrics_json: metrics,
         };
@@ -193,10 +193,6 @@ impl FakeWorker {
             .await
             .unwrap();
     }
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Writes the smallest bundle that verifies; returns the summary of its metrics.
