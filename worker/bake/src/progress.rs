@@ -100,11 +100,14 @@ impl<'a> Reporter<'a> {
     }
 
     pub(crate) fn info(&self, message: impl Into<String>) {
-        tracing::info!("{}", self.log(Level::Info, message.into()));
+        // Evaluated before the macro, which skips its arguments when nobody listens.
+        let message = self.log(Level::Info, message.into());
+        tracing::info!("{message}");
     }
 
     pub(crate) fn warn(&self, message: impl Into<String>) {
-        tracing::warn!("{}", self.log(Level::Warn, message.into()));
+        let message = self.log(Level::Warn, message.into());
+        tracing::warn!("{message}");
     }
 
     fn log(&self, level: Level, message: String) -> String {
