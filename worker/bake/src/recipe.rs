@@ -127,7 +127,7 @@ impl Recipe {
             },
             effects_steps: if paper { epochs(64) } else { 2000 },
             effects_batch: 8192,
-            composition_steps: if paper { epochs(64) } else { 1500 },
+            composition_steps: if paper { epochs(64) } else { 1000 },
             batch: 4,
             patch: 64,
             ablate_effects: true,
