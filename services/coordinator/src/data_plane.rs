@@ -44,7 +44,7 @@ use crate::trace;
 /// Largest blob.
 const MAX_BLOB_BYTES: u64 = 64 * 1024 * 1024 * 1024;
 /// Longest silence in the middle of a body.
-const IDLE: Duration = Duration::from_secs(60);
+const IDLE: Duration = Duration::from_mins(1);
 /// A signed URL lives this long; a read that has begun goes on.
 const SIGNED_FOR: Duration = Duration::from_mins(10);
 
@@ -128,7 +128,7 @@ async fn read_blob(
             CACHE_CONTROL,
             HeaderValue::from_static("private, max-age=31536000, immutable"),
         ),
-        (CONTENT_DIGEST, text(&digest)),
+        (CONTENT_DIGEST, text(digest.as_str())),
     ];
     if method == Method::HEAD {
         return Ok((common, [(CONTENT_LENGTH, HeaderValue::from(size))]).into_response());
@@ -165,7 +165,7 @@ async fn read_blob(
             );
             response
                 .headers_mut()
-                .insert(CONTENT_RANGE, text(format!("bytes */{size}")));
+                .insert(CONTENT_RANGE, text(&format!("bytes */{size}")));
             return Ok(response);
         }
     };
@@ -183,7 +183,7 @@ async fn read_blob(
     if let Some(Range { start, end }) = range {
         response.headers_mut().insert(
             CONTENT_RANGE,
-            text(format!("bytes {start}-{}/{size}", end - 1)),
+            text(&format!("bytes {start}-{}/{size}", end - 1)),
         );
     }
     Ok(response)
@@ -227,7 +227,7 @@ fn wanted_range(header: &str, size: u64) -> Wanted {
 }
 
 fn etag(digest: &Digest) -> HeaderValue {
-    text(format!("\"{digest}\""))
+    text(&format!("\"{digest}\""))
 }
 
 fn names_etag(given: &HeaderValue, etag: &HeaderValue) -> bool {
@@ -241,8 +241,8 @@ fn names_etag(given: &HeaderValue, etag: &HeaderValue) -> bool {
 }
 
 /// A header from text of our own making, which is always ASCII.
-fn text(value: impl ToString) -> HeaderValue {
-    HeaderValue::from_str(&value.to_string()).unwrap_or(HeaderValue::from_static(""))
+fn text(value: &str) -> HeaderValue {
+    HeaderValue::from_str(value).unwrap_or(HeaderValue::from_static(""))
 }
 
 // ---------------------------------------------------------------- uploads
@@ -450,17 +450,17 @@ fn upload_answer(status: StatusCode, object: &ObjectName, id: UploadId, offset: 
     // OCI has no way to say "nothing yet": its registries answer 0-0 then.
     let last = offset.saturating_sub(1);
     let headers = [
-        (LOCATION, text(format!("/v2/{object}/blobs/uploads/{id}"))),
-        (RANGE, text(format!("0-{last}"))),
-        (UPLOAD_UUID, text(id)),
+        (LOCATION, text(&format!("/v2/{object}/blobs/uploads/{id}"))),
+        (RANGE, text(&format!("0-{last}"))),
+        (UPLOAD_UUID, text(&id.to_string())),
     ];
     (status, headers).into_response()
 }
 
 fn created(kind: &str, object: &ObjectName, digest: &Digest) -> Response {
     let headers = [
-        (LOCATION, text(format!("/v2/{object}/{kind}/{digest}"))),
-        (CONTENT_DIGEST, text(digest)),
+        (LOCATION, text(&format!("/v2/{object}/{kind}/{digest}"))),
+        (CONTENT_DIGEST, text(digest.as_str())),
     ];
     (StatusCode::CREATED, headers).into_response()
 }
@@ -497,7 +497,7 @@ async fn read_manifest(
     let etag = etag(&digest);
     let common = [
         (CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE)),
-        (CONTENT_DIGEST, text(&digest)),
+        (CONTENT_DIGEST, text(digest.as_str())),
         (ETAG, etag.clone()),
     ];
     if headers

@@ -18,6 +18,7 @@ use tracing_subscriber::EnvFilter;
 /// AWS_ENDPOINT, AWS_ALLOW_HTTP.
 #[derive(Debug, Parser)]
 #[command(version)]
+#[expect(clippy::doc_markdown, reason = "these texts are the command's help")]
 struct Args {
     /// Address to listen on; port 0 takes a free one.
     #[arg(long, env = "IGN_LISTEN", default_value = "127.0.0.1:0")]

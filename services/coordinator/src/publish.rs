@@ -1,9 +1,12 @@
 //! Publishing a bundle, and the bucket's copy of what is published.
 //!
 //! Order of a publish, each step idempotent, so that a call cut anywhere is repeated by the worker:
-//! 1. every blob is there with its size; 2. the manifest is written (nobody names it yet); 3. the database, under the
-//! job's row lock and after checking the attempt, makes it version N and ends the job: this alone is the commit;
-//! 4. the bucket gets the version's record and the object's aliases.
+//!
+//! 1. Every blob is there with its size.
+//! 2. The manifest is written; nobody names it yet.
+//! 3. The database, under the job's row lock and after checking the attempt, makes it version N and ends the job. This
+//!    alone is the commit.
+//! 4. The bucket gets the version's record and the object's aliases.
 //!
 //! A crash between 3 and 4 is repaired by [`App::mirror_all`] at start; a store that failed is tried again by the
 //! maintenance task. Aliases are written as the database has them at that time, and read again afterwards until both
@@ -108,7 +111,7 @@ impl App {
         };
         stream::iter(objects)
             .for_each_concurrent(OBJECTS_IN_FLIGHT, |object| async move {
-                self.mirror(&object, None).await
+                self.mirror(&object, None).await;
             })
             .await;
     }

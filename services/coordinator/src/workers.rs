@@ -18,7 +18,7 @@ use crate::http_answer::Refused;
 use crate::trace;
 
 /// Longest long poll.
-const MAX_WAIT: Duration = Duration::from_secs(60);
+const MAX_WAIT: Duration = Duration::from_mins(1);
 
 type Answer<T> = Result<Response<T>, Status>;
 

@@ -1,0 +1,144 @@
+//! Starting, waiting, stopping.
+
+use std::time::{Duration, Instant};
+
+use ign_coordinator::ServeError;
+use ign_proto::v1;
+use reqwest::{Method, StatusCode};
+use tokio_stream::StreamExt as _;
+
+use crate::fixture::Service;
+
+#[tokio::test]
+async fn a_waiting_worker_gets_a_new_job_at_once() {
+    let mut service = Service::start().await;
+    let waiting = tokio::spawn({
+        let mut workers = service.workers.clone();
+        async move {
+            let request = v1::LeaseRequest {
+                worker_id: "worker-1".to_owned(),
+                wait_secs: 20.0,
+                ..Default::default()
+            };
+            let lease = workers.lease(request).await.unwrap().into_inner().lease;
+            (lease, Instant::now())
+        }
+    });
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    service.submit("museum/vase", "request-1").await;
+    let submitted = Instant::now();
+    let (lease, leased) = waiting.await.unwrap();
+    assert!(lease.is_some());
+    assert!(leased.saturating_duration_since(submitted) < Duration::from_secs(1));
+}
+
+#[tokio::test]
+async fn stopping_ends_streams_and_long_polls_soon() {
+    let mut service = Service::start().await;
+    let endpoint = service.folder.join("endpoint.json");
+    let written: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(&endpoint).unwrap()).unwrap();
+    assert_eq!(written["url"], service.url.as_str());
+    assert_eq!(written["pid"], std::process::id());
+    assert_eq!(
+        written["token_file"],
+        service.folder.join("token").display().to_string()
+    );
+
+    let job = service.submit("museum/vase", "request-1").await;
+    service.lease("worker-0", 5.0).await.unwrap();
+    let request = v1::GetJobRequest {
+        job_id: job.id.clone(),
+    };
+    let mut watched = service.jobs.watch(request).await.unwrap().into_inner();
+    watched.next().await.unwrap().unwrap();
+    let waiting = tokio::spawn({
+        let mut workers = service.workers.clone();
+        async move {
+            let request = v1::LeaseRequest {
+                worker_id: "worker-1".to_owned(),
+                wait_secs: 60.0,
+                ..Default::default()
+            };
+            workers.lease(request).await
+        }
+    });
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    let begun = Instant::now();
+    service.stop().await;
+    assert!(
+        begun.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        begun.elapsed()
+    );
+    assert!(!endpoint.exists());
+    assert!(waiting.await.unwrap().unwrap().into_inner().lease.is_none());
+    let ended = watched.next().await.unwrap().unwrap_err();
+    assert!(ign_proto::Cause::from_status(&ended).retryable());
+
+    service.restart().await;
+    let kept = service.get(&job.id).await;
+    assert_eq!(
+        kept.state(),
+        v1::JobState::Leased,
+        "a restart loses nothing"
+    );
+}
+
+#[tokio::test]
+async fn a_message_that_is_too_large_is_refused() {
+    let mut service = Service::start().await;
+    let request = v1::LogsRequest {
+        job_id: "x".repeat(17 * 1024 * 1024),
+        ..Default::default()
+    };
+    assert_eq!(
+        service.jobs.logs(request).await.unwrap_err().code(),
+        tonic::Code::OutOfRange
+    );
+    let large = vec![b' '; 5 * 1024 * 1024];
+    let path = format!("/v2/c/o/manifests/{}", ign_proto::Digest::of(&large));
+    let answer = service
+        .request(Method::PUT, &path)
+        .body(large)
+        .send()
+        .await
+        .unwrap();
+    assert_eq!(answer.status(), StatusCode::PAYLOAD_TOO_LARGE);
+}
+
+#[tokio::test]
+async fn a_coordinator_that_cannot_work_says_why() {
+    let dir = tempfile::tempdir().unwrap();
+    let token = dir.path().join("token");
+    std::fs::write(&token, "0123456789abcdef").unwrap();
+    let config = |change: fn(&mut ign_coordinator::Config)| {
+        let mut config = ign_coordinator::Config {
+            listen: "127.0.0.1:0".parse().unwrap(),
+            database: format!("sqlite://{}/ign.db", dir.path().display()),
+            store: ign_registry::StoreConfig::new(format!("file://{}/store", dir.path().display())),
+            token_file: token.clone(),
+            endpoint_file: None,
+            settings: ign_queue::Settings::default(),
+            redirect_blobs: false,
+        };
+        change(&mut config);
+        ign_coordinator::serve(config, std::future::pending())
+    };
+    let error = config(|config| config.token_file = "/absent".into())
+        .await
+        .unwrap_err();
+    assert!(matches!(error, ServeError::Token { .. }), "{error}");
+    let error = config(|config| config.database = "mysql://x".to_owned())
+        .await
+        .unwrap_err();
+    assert!(matches!(error, ServeError::Database { .. }), "{error}");
+    let error = config(|config| config.store.url = "file:///dev/null/x".to_owned())
+        .await
+        .unwrap_err();
+    assert!(matches!(error, ServeError::Registry { .. }), "{error}");
+    let error = config(|config| config.endpoint_file = Some("/dev/null/x".into()))
+        .await
+        .unwrap_err();
+    assert!(matches!(error, ServeError::Endpoint { .. }), "{error}");
+}
