@@ -4,15 +4,9 @@ use ign_events::{Event, Level, Progress};
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
-/// Stages with their share of a bake's expected time.
-const STAGES: [(&str, f64); 6] = [
-    ("import", 4.0),
-    ("plan", 6.0),
-    ("effects", 25.0),
-    ("composition", 55.0),
-    ("evaluate", 8.0),
-    ("pack", 2.0),
-];
+/// Share of a bake's expected time per stage.
+pub(crate) type Shares = Vec<(&'static str, f64)>;
+
 /// Progress events at most this often.
 const INTERVAL: Duration = Duration::from_millis(500);
 
@@ -23,6 +17,9 @@ pub(crate) struct Reporter<'a> {
 }
 
 struct State {
+    shares: Shares,
+    /// Part of the stage that steps report on.
+    part: (f64, f64),
     started: Instant,
     /// Percent at the start: a resumed bake does not begin at 0, and its estimate must not either.
     first_percent: Option<f64>,
@@ -39,6 +36,8 @@ impl<'a> Reporter<'a> {
         Self {
             sink,
             state: RefCell::new(State {
+                shares: shares(&[]),
+                part: (0.0, 1.0),
                 started: now,
                 first_percent: None,
                 last_sent: None,
@@ -50,12 +49,23 @@ impl<'a> Reporter<'a> {
         }
     }
 
+    /// Adds stages that only some bakes have, between `composition` and `evaluate`.
+    pub(crate) fn expect(&self, extra: &[(&'static str, f64)]) {
+        self.state.borrow_mut().shares = shares(extra);
+    }
+
+    /// Says which part of the stage the next steps are.
+    pub(crate) fn part(&self, from: f64, to: f64) {
+        self.state.borrow_mut().part = (from, to);
+    }
+
     /// Begins a stage; the time of the former one is kept.
     pub(crate) fn stage(&self, stage: &'static str, message: &str) {
         {
             let mut state = self.state.borrow_mut();
             close_stage(&mut state);
             state.stage = stage;
+            state.part = (0.0, 1.0);
             state.last_sent = None;
         }
         self.step(0.0, message);
@@ -69,16 +79,21 @@ impl<'a> Reporter<'a> {
             return;
         }
         state.last_sent = Some(now);
-        let before: f64 = STAGES
+        let total: f64 = state.shares.iter().map(|(_, share)| share).sum();
+        let before: f64 = state
+            .shares
             .iter()
             .take_while(|(name, _)| *name != state.stage)
             .map(|(_, share)| share)
             .sum();
-        let share = STAGES
+        let share = state
+            .shares
             .iter()
             .find(|(name, _)| *name == state.stage)
             .map_or(0.0, |(_, share)| *share);
-        let percent = before + share * fraction.clamp(0.0, 1.0);
+        let (from, to) = state.part;
+        let fraction = from + (to - from) * fraction.clamp(0.0, 1.0);
+        let percent = 100.0 * (before + share * fraction) / total;
         let first = *state.first_percent.get_or_insert(percent);
         let done = percent - first;
         let eta_secs =
@@ -128,6 +143,21 @@ impl<'a> Reporter<'a> {
         close_stage(&mut state);
         state.stages.clone()
     }
+}
+
+fn shares(extra: &[(&'static str, f64)]) -> Shares {
+    let before = [
+        ("import", 4.0),
+        ("plan", 6.0),
+        ("effects", 25.0),
+        ("composition", 35.0),
+    ];
+    let after = [("evaluate", 8.0), ("pack", 4.0)];
+    before
+        .into_iter()
+        .chain(extra.iter().copied())
+        .chain(after)
+        .collect()
 }
 
 fn close_stage(state: &mut State) {

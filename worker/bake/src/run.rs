@@ -280,6 +280,11 @@ impl Bake<'_> {
         };
         reporter.info(words.clone());
 
+        let both = keep && settings.ablate_effects;
+        let mut extra = Vec::new();
+        extra.extend(both.then_some(("ablation", 30.0)));
+        extra.extend(settings.compare_paper.then_some(("comparison", 60.0)));
+        reporter.expect(&extra);
         reporter.stage("composition", "training CompositionNet");
         let whole = self
             .budget(1)
@@ -289,15 +294,12 @@ impl Bake<'_> {
         let (model, secs) = match with_effects.filter(|_| keep) {
             Some(model) => {
                 let effects_secs = session.secs(effects::STAGE);
-                let budget = if settings.ablate_effects {
-                    self.budget(1)
-                } else {
-                    whole
-                };
+                let budget = if both { self.budget(1) } else { whole };
                 let model =
                     self.blend(session, model, COMPOSITION, "ours", budget, effects_secs)?;
                 let secs = effects_secs + session.secs(COMPOSITION);
-                if settings.ablate_effects {
+                if both {
+                    reporter.stage("ablation", "training CompositionNet without effects");
                     let plain = self.blend(
                         session,
                         plain,
@@ -320,6 +322,7 @@ impl Bake<'_> {
             ),
         };
         if settings.compare_paper {
+            reporter.stage("comparison", "training the paper's networks for as long");
             let model = self.train_paper(session, Some(secs), "paper")?;
             others.push(Other {
                 method: "paper",
@@ -382,6 +385,9 @@ impl Bake<'_> {
     /// Preset `paper`.
     fn paper(&self, session: &mut Session<'_>, plain: Model) -> Result<Trained, BakeError> {
         drop(plain);
+        session
+            .reporter
+            .stage("composition", "training the paper's networks");
         let model = self.train_paper(session, self.job.recipe.budget_secs, "ours")?;
         let plan = json!({
             "preset": "paper",
@@ -409,9 +415,7 @@ impl Bake<'_> {
             Preset::Paper => (self.settings.effects_steps, self.settings.composition_steps),
             Preset::Standard => (epochs, epochs),
         };
-        session
-            .reporter
-            .stage("effects", "training the paper's EffectsNet");
+        session.reporter.part(0.0, PAPER_EFFECTS_SHARE);
         if session.finished(PAPER_EFFECTS).is_none() {
             let schedule = Schedule {
                 steps: effects_steps,
@@ -421,9 +425,7 @@ impl Bake<'_> {
         }
         let plain = self.plain(ign_render::Recipe::Paper);
         let mut model = plain.with_effects(effects::restore(data, session, PAPER_EFFECTS, true)?);
-        session
-            .reporter
-            .stage("composition", "training the paper's CompositionNet");
+        session.reporter.part(PAPER_EFFECTS_SHARE, 1.0);
         if session.finished(PAPER_COMPOSITION).is_none() {
             let plan = Plan {
                 stage: PAPER_COMPOSITION,
