@@ -22,9 +22,9 @@ use crate::problem::{Doing as _, Problem, chain};
 #[derive(Clone, Debug, Default, clap::Args)]
 #[command(next_help_heading = "Connection")]
 pub(crate) struct ConnectionArgs {
-    /// Coordinator to use, such as <http://bakery.local:7070>; without it, the one of the data folder
     #[arg(
         long,
+        help = "Coordinator, such as http://bakery:7070; without it, the one of the data folder",
         env = "IGN_SERVER",
         global = true,
         value_name = "URL",
@@ -42,7 +42,7 @@ pub(crate) struct ConnectionArgs {
     pub(crate) token_file: Option<PathBuf>,
     #[arg(
         long,
-        help = "Data folder of the service on this machine [default: $XDG_DATA_HOME/ign or ~/.local/share/ign]",
+        help = "Data folder of the service on this machine [default: ~/.local/share/ign]",
         env = "IGN_DATA",
         global = true,
         value_name = "DIR",

@@ -246,6 +246,12 @@ fn take_lock(data: &Path) -> Result<File, Problem> {
     Ok(lock)
 }
 
+/// Whether another process runs a service on this data folder.
+pub(crate) fn is_taken(data: &Path) -> bool {
+    File::open(data.join("lock"))
+        .is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock)))
+}
+
 /// Creates a random token that only this user can read, unless there is one.
 fn ensure_token(path: &Path) -> Result<(), Problem> {
     use std::os::unix::fs::OpenOptionsExt as _;
@@ -306,11 +312,13 @@ mod tests {
         let data = tempfile::tempdir().unwrap();
         let lock = take_lock(data.path()).unwrap();
         let refused = take_lock(data.path()).unwrap_err();
+        assert!(is_taken(data.path()));
         assert!(
             refused.what.contains(&std::process::id().to_string()),
             "{refused}"
         );
         drop(lock);
+        assert!(!is_taken(data.path()));
         take_lock(data.path()).unwrap();
     }
 

@@ -34,7 +34,7 @@ use crate::problem::{Exit, Problem};
 struct Cli {
     #[command(flatten)]
     connection: ConnectionArgs,
-    /// Form of the data on stdout
+    /// Form of the data on stdout; json and yaml have stable field names
     #[arg(
         short,
         long,

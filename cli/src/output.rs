@@ -19,12 +19,10 @@ use crate::problem::Problem;
 /// How data is written to stdout.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Format {
-    /// For people; may change.
+    // No doc comments: clap would print each on a line of its own in every help text.
     #[default]
     Table,
-    /// Stable field names.
     Json,
-    /// The same fields as YAML.
     Yaml,
 }
 
@@ -320,8 +318,10 @@ impl Live {
     pub(crate) fn transfer(what: &str, total_bytes: u64) -> Self {
         let style =
             style("{prefix:>10} {bar:28} {bytes}/{total_bytes}  {bytes_per_sec}  eta {eta}");
-        let live = Self::new(ProgressBar::new(total_bytes), style);
+        let mut live = Self::new(ProgressBar::new(total_bytes), style);
         live.bar.set_prefix(what.to_string());
+        // Without a terminal, only a transfer that takes its time is worth a line.
+        live.said = std::sync::Mutex::new((what.to_string(), Some(std::time::Instant::now())));
         live
     }
 
@@ -363,7 +363,12 @@ impl Live {
         self.bar
             .set_message(format!("{percent:3.0}%  {}", printable(message)));
         if self.plain {
-            self.say(stage, &format!("{stage} {percent:.0}%  {message}"));
+            let done = if percent > 0.0 {
+                format!(" {percent:.0}%")
+            } else {
+                String::new()
+            };
+            self.say(stage, format!("{stage}{done}  {message}").trim_end());
         }
     }
 

@@ -10,12 +10,13 @@ use crate::problem::Problem;
 use crate::views::{JobView, is_terminal, short_id};
 
 /// How long a coordinator may be away before following is given up; the job itself does not mind.
-const PATIENCE: Duration = Duration::from_mins(2);
+pub(crate) const PATIENCE: Duration = Duration::from_mins(2);
 
-/// Follows a job until it ends; `changed` sees each state of it.
+/// Follows a job until it ends; `changed` sees each state of it. Gives up when nothing answers for `patience`.
 pub(crate) async fn until_end(
     connection: &Connection,
     job_id: &str,
+    patience: Duration,
     mut changed: impl FnMut(&v1::Job),
 ) -> Result<v1::Job, Problem> {
     let mut away_since: Option<Instant> = None;
@@ -27,7 +28,7 @@ pub(crate) async fn until_end(
             Err(status) => return Err(status.into()),
         };
         let since = *away_since.get_or_insert_with(Instant::now);
-        if since.elapsed() > PATIENCE {
+        if since.elapsed() > patience {
             let problem = broken.map_or_else(
                 || Problem::unreachable("the coordinator ends every watch at once"),
                 Problem::from,
@@ -98,7 +99,8 @@ pub(crate) fn show(live: &Live, job: &v1::Job) {
                 parts.join("  ").trim_end(),
             );
         }
-        state => live.set(state, 100.0, ""),
+        // How it ended is for the caller to say.
+        _ => {}
     }
 }
 

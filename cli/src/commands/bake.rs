@@ -1,14 +1,14 @@
 //! `bake`: one capture from folder to verified bundle, with the service that runs or one that lives as long as the bake.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, OnceLock};
-use std::time::Duration;
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
 
 use ign_proto::{Digest, ObjectName, v1};
 
 use crate::Context;
-use crate::connection::{Connection, EndpointFile};
-use crate::embedded::{Embedded, Options, interrupted};
+use crate::connection::Connection;
+use crate::embedded::{self, Embedded, Options, interrupted};
 use crate::output::{self, Live};
 use crate::pack;
 use crate::problem::{Exit, Problem};
@@ -21,6 +21,11 @@ use crate::watch;
 /// Somebody waits for a bake of this kind; what was queued earlier can wait a little longer.
 const FOREGROUND_PRIORITY: i32 = 10;
 
+/// How long to wait for a service that is starting or ending on the data folder.
+const TAKEN_PATIENCE: Duration = Duration::from_secs(20);
+/// A service of this machine that is silent for so long has ended.
+const LOCAL_PATIENCE: Duration = Duration::from_secs(10);
+
 /// Arguments of `bake`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
@@ -32,14 +37,15 @@ pub(crate) struct Args {
     /// Proxy mesh to use instead of the capture's own
     #[arg(long, value_name = "FILE")]
     proxy: Option<PathBuf>,
-    #[command(flatten)]
-    recipe: RecipeArgs,
     /// Folder for the results [default: bake-out/OBJECT]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Key under which repeating the command finds the same job [default: a new one each time]
     #[arg(long, value_name = "ID")]
     request_id: Option<String>,
+    // Last, because its heading holds for what follows.
+    #[command(flatten)]
+    recipe: RecipeArgs,
 }
 
 pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
@@ -64,42 +70,78 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
         priority: 0,
     };
 
-    let (connection, service) = connect(context).await?;
-    let Some(mut service) = service else {
-        let job_id = Arc::new(OnceLock::new());
-        return tokio::select! {
-            outcome = bake(context, &connection, &order, args, &out, &job_id) => outcome,
-            signal = interrupted() => {
-                signal?;
-                if let Some(id) = job_id.get() {
-                    output::note(&format!(
-                        "job {id} goes on; come back with `ignctl wait {0}`, stop it with `ignctl cancel {0}`",
-                        short_id(id)
-                    ));
-                }
-                Err(Problem::said(Exit::Failed))
+    loop {
+        let (connection, service) = connect(context).await?;
+        if let Some(service) = service {
+            if args.request_id.is_none() {
+                order.priority = FOREGROUND_PRIORITY;
             }
-        };
-    };
-    order.priority = FOREGROUND_PRIORITY;
-    let job_id = Arc::new(OnceLock::new());
+            return with_own(context, &connection, service, &order, args, &out).await;
+        }
+        match with_running(context, &connection, &order, args, &out).await {
+            // The service was another bake's, which has ended: go on with the job under one of our own.
+            Err(problem)
+                if problem.exit == Exit::Unreachable && context.connection.server.is_none() =>
+            {
+                output::warn("the service has gone; looking for another");
+            }
+            outcome => return outcome,
+        }
+    }
+}
+
+/// Bakes with a service that runs; Ctrl-C leaves the job to it.
+async fn with_running(
+    context: &Context,
+    connection: &Connection,
+    order: &Order,
+    args: &Args,
+    out: &Path,
+) -> Result<(), Problem> {
+    let job_id = OnceLock::new();
+    tokio::select! {
+        outcome = bake(context, connection, order, args, out, &job_id) => outcome,
+        signal = interrupted() => {
+            signal?;
+            if let Some(id) = job_id.get() {
+                output::note(&format!(
+                    "job {id} goes on; come back with `ignctl wait {0}`, stop it with `ignctl cancel {0}`",
+                    short_id(id)
+                ));
+            }
+            Err(Problem::said(Exit::Failed))
+        }
+    }
+}
+
+/// Bakes with a service of its own, which ends with it; Ctrl-C cancels the job.
+async fn with_own(
+    context: &Context,
+    connection: &Connection,
+    mut service: Embedded,
+    order: &Order,
+    args: &Args,
+    out: &Path,
+) -> Result<(), Problem> {
+    let job_id = OnceLock::new();
     let outcome = tokio::select! {
-        outcome = bake(context, &connection, &order, args, &out, &job_id) => outcome,
+        outcome = bake(context, connection, order, args, out, &job_id) => outcome,
         problem = service.broken() => Err(problem),
         signal = interrupted() => {
             signal?;
             if let Some(id) = job_id.get() {
                 output::note("cancelling");
-                cancel(&connection, id).await;
+                cancel(connection, id).await;
             }
             Err(Problem::said(Exit::Failed))
         }
     };
-    let left = left_over(&connection).await;
+    let left = left_over(connection).await;
     let stopped = service.stop().await;
     if left > 0 {
+        let jobs = if left == 1 { "job waits" } else { "jobs wait" };
         output::note(&format!(
-            "{left} other jobs stay queued; `ignctl up` runs them"
+            "{left} {jobs} in the data folder; `ignctl up` runs what is queued"
         ));
     }
     outcome.and(stopped)
@@ -107,41 +149,37 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
 
 /// The service that runs, or else a new one for the time of this bake.
 async fn connect(context: &Context) -> Result<(Connection, Option<Embedded>), Problem> {
-    match Connection::open(&context.connection).await {
-        Ok(connection) => return Ok((connection, None)),
-        Err(problem)
-            if problem.exit == Exit::Unreachable && context.connection.server.is_none() => {}
-        Err(problem) => return Err(problem),
-    }
-    let data = context.connection.data_dir()?;
-    let options = Options {
-        data: data.clone(),
-        workers: 1,
-        threads: None,
-        listen: std::net::SocketAddr::from(([127, 0, 0, 1], 0)),
-        own: true,
-    };
-    match Embedded::start(&options).await {
-        Ok(service) => {
-            output::note(&format!(
-                "service started for this bake; data in {}",
-                data.display()
-            ));
-            let connection = Connection::to(service.target.clone()).await?;
-            Ok((connection, Some(service)))
-        }
-        // Another process took the folder meanwhile: use its service, once it listens.
-        Err(problem) => {
-            for _ in 0..50 {
-                if EndpointFile::of_live_service(&data)
-                    .is_some_and(|endpoint| endpoint.pid != std::process::id())
-                    && let Ok(connection) = Connection::open(&context.connection).await
-                {
-                    return Ok((connection, None));
-                }
-                tokio::time::sleep(Duration::from_millis(100)).await;
-            }
+    let data = context.connection.data_dir();
+    let began = Instant::now();
+    loop {
+        match Connection::open(&context.connection).await {
+            Ok(connection) => return Ok((connection, None)),
             Err(problem)
+                if problem.exit == Exit::Unreachable && context.connection.server.is_none() => {}
+            Err(problem) => return Err(problem),
+        }
+        let data = data.clone()?;
+        let options = Options {
+            data: data.clone(),
+            workers: 1,
+            threads: None,
+            listen: std::net::SocketAddr::from(([127, 0, 0, 1], 0)),
+            own: true,
+        };
+        match Embedded::start(&options).await {
+            Ok(service) => {
+                output::note(&format!(
+                    "service started for this bake; data in {}",
+                    data.display()
+                ));
+                let connection = Connection::to(service.target.clone()).await?;
+                return Ok((connection, Some(service)));
+            }
+            // Another service is just starting or ending there.
+            Err(_) if embedded::is_taken(&data) && began.elapsed() < TAKEN_PATIENCE => {
+                tokio::time::sleep(Duration::from_millis(200)).await;
+            }
+            Err(problem) => return Err(problem),
         }
     }
 }
@@ -161,7 +199,12 @@ async fn bake(
     let _first = job_id.set(job.id.clone());
 
     let live = Live::percent();
-    let job = watch::until_end(connection, &job.id, |job| watch::show(&live, job)).await?;
+    let patience = match context.connection.server {
+        Some(_) => watch::PATIENCE,
+        None => LOCAL_PATIENCE,
+    };
+    let show = |job: &v1::Job| watch::show(&live, job);
+    let job = watch::until_end(connection, &job.id, patience, show).await?;
     live.clear();
     if job.state() != v1::JobState::Succeeded {
         return Err(watch::failure(&job));
@@ -273,7 +316,7 @@ async fn cancel(connection: &Connection, job_id: &str) {
         .await
         .map(tonic::Response::into_inner);
     if cancelled.is_ok_and(|job| !is_terminal(job.state())) {
-        let end = watch::until_end(connection, job_id, |_| ());
+        let end = watch::until_end(connection, job_id, LOCAL_PATIENCE, |_| ());
         if tokio::time::timeout(Duration::from_secs(20), end)
             .await
             .is_err()

@@ -490,7 +490,7 @@ pub(crate) async fn wait_for(
                         .unwrap_or_else(std::sync::PoisonError::into_inner);
                     latest.insert(job.id.clone(), job.clone());
                 };
-                let job = watch::until_end(connection, &id, |job| {
+                let job = watch::until_end(connection, &id, watch::PATIENCE, |job| {
                     keep(job);
                     show(job);
                 })

@@ -40,8 +40,6 @@ pub(crate) struct Args {
     /// Collection; the objects are named by capture.toml or by their folders
     #[arg(long, value_name = "C", conflicts_with = "manifest")]
     collection: Option<CollectionId>,
-    #[command(flatten)]
-    recipe: RecipeArgs,
     /// Jobs of higher priority go first
     #[arg(long, value_name = "N", default_value_t = 0, allow_hyphen_values = true, value_parser = clap::value_parser!(i32).range(-1000..=1000))]
     priority: i32,
@@ -54,6 +52,9 @@ pub(crate) struct Args {
     /// Queue a new job even where the same one was queued before
     #[arg(long)]
     again: bool,
+    // Last, because its heading holds for what follows.
+    #[command(flatten)]
+    recipe: RecipeArgs,
 }
 
 /// What became of one capture.

@@ -51,7 +51,7 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
     }
     let plural =
         |count: usize, noun: &str| format!("{count} {noun}{}", if count == 1 { "" } else { "s" });
-    output::note(&output::pairs(&[
+    let facts = output::pairs(&[
         ("listening", service.target.url.to_string()),
         ("data", options.data.display().to_string()),
         ("token", options.data.join("token").display().to_string()),
@@ -64,7 +64,8 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
             ),
         ),
         ("logs", service.logs.display().to_string()),
-    ]));
+    ]);
+    output::note(facts.trim_end());
     output::note(
         "Ctrl-C ends the service; running jobs go on from their last checkpoint when it starts again",
     );

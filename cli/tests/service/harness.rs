@@ -37,7 +37,31 @@ fn command(args: &[&str], env: &[(&str, &str)]) -> Command {
 
 /// Runs ignctl to its end.
 pub(crate) fn run(args: &[&str], env: &[(&str, &str)]) -> Output {
-    command(args, env).output().unwrap()
+    let streams = [
+        tempfile::NamedTempFile::new().unwrap(),
+        tempfile::NamedTempFile::new().unwrap(),
+    ];
+    let mut child = command(args, env)
+        .stdout(streams[0].reopen().unwrap())
+        .stderr(streams[1].reopen().unwrap())
+        .spawn()
+        .unwrap();
+    let start = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            break status;
+        }
+        if start.elapsed() > LIMIT {
+            child.kill().unwrap();
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    let [stdout, stderr] = streams.map(|stream| std::fs::read(stream.path()).unwrap());
+    Output {
+        status,
+        stdout,
+        stderr,
+    }
 }
 
 pub(crate) fn stdout(output: &Output) -> String {

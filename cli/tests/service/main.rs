@@ -478,6 +478,33 @@ fn a_bake_of_its_own_ends_when_its_worker_cannot_run() {
 }
 
 #[test]
+fn a_bake_whose_service_ends_goes_on_with_its_own() {
+    let work = tempfile::tempdir().unwrap();
+    let dir = capture(work.path(), "vase");
+    let worker = harness::script(work.path(), "worker", "cat > /dev/null");
+    let data = work.path().join("data");
+    let service = Service::on(&data);
+    let args = [
+        "--data",
+        data.to_str().unwrap(),
+        "bake",
+        dir.to_str().unwrap(),
+        "--object",
+        "museum/vase",
+    ];
+    let env = [("IGN_WORKER", worker.to_str().unwrap())];
+    let bake = harness::spawn(&args, &env, &work.path().join("log"));
+    service.wait_for_jobs(1);
+    drop(service);
+    let said = bake.interrupt("joining");
+    assert!(said.contains("service started for this bake"), "{said}");
+    let service = Service::on(&data);
+    let jobs = json(&service.run(&["jobs", "list", "-o", "json"]));
+    assert_eq!(jobs.as_array().unwrap().len(), 1);
+    assert_eq!(jobs[0]["state"], "cancelled");
+}
+
+#[test]
 fn ctrl_c_cancels_the_job_of_a_bake_of_its_own() {
     let work = tempfile::tempdir().unwrap();
     let dir = capture(work.path(), "vase");
