@@ -26,43 +26,82 @@ impl Changes {
     }
 }
 
+/// What sort of change it was.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Change {
+    /// Nobody need look.
+    Nothing,
+    /// Something can be seen.
+    Job,
+    /// Something can be seen, and a lease may succeed that did not before.
+    Work,
+}
+
+/// Numbers of changes that this process made.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Own {
+    pub(crate) all: u64,
+    pub(crate) work: u64,
+}
+
 /// The sending side, inside a store.
 #[derive(Debug)]
 pub(crate) struct Signal {
-    generation: watch::Sender<u64>,
-    /// Changes that this process made, to be told to others.
-    own: watch::Sender<u64>,
+    all: watch::Sender<u64>,
+    work: watch::Sender<u64>,
+    own: watch::Sender<Own>,
     poll: Duration,
 }
 
 impl Signal {
     pub(crate) fn new(poll: Duration) -> Self {
         Self {
-            generation: watch::Sender::new(0),
-            own: watch::Sender::new(0),
+            all: watch::Sender::new(0),
+            work: watch::Sender::new(0),
+            own: watch::Sender::new(Own::default()),
             poll,
         }
     }
 
     /// After this process changed something.
-    pub(crate) fn raise(&self) {
-        bump(&self.own);
-        bump(&self.generation);
+    pub(crate) fn raise(&self, change: Change) {
+        if change == Change::Nothing {
+            return;
+        }
+        self.own.send_modify(|own| {
+            own.all = own.all.wrapping_add(1);
+            if change == Change::Work {
+                own.work = own.work.wrapping_add(1);
+            }
+        });
+        self.raise_foreign(change);
     }
 
-    /// After another process did.
-    pub(crate) fn raise_foreign(&self) {
-        bump(&self.generation);
+    /// After another process did; it is not told further.
+    pub(crate) fn raise_foreign(&self, change: Change) {
+        if change == Change::Work {
+            bump(&self.work);
+        }
+        if change != Change::Nothing {
+            bump(&self.all);
+        }
     }
 
     pub(crate) fn subscribe(&self) -> Changes {
         Changes {
-            generation: self.generation.subscribe(),
+            generation: self.all.subscribe(),
             poll: self.poll,
         }
     }
 
-    pub(crate) fn subscribe_own(&self) -> watch::Receiver<u64> {
+    pub(crate) fn subscribe_work(&self) -> Changes {
+        Changes {
+            generation: self.work.subscribe(),
+            poll: self.poll,
+        }
+    }
+
+    pub(crate) fn subscribe_own(&self) -> watch::Receiver<Own> {
         self.own.subscribe()
     }
 }

@@ -130,10 +130,10 @@ pub(crate) fn clean(text: &str, max_bytes: usize) -> String {
     text[..end].replace('\0', "\u{FFFD}")
 }
 
-pub(crate) fn log_line(line: NewLogLine) -> NewLogLine {
+pub(crate) fn log_line(line: &NewLogLine) -> NewLogLine {
     NewLogLine {
         message: clean(&line.message, MAX_LOG_LINE_BYTES),
-        ..line
+        ..*line
     }
 }
 
@@ -146,11 +146,11 @@ pub(crate) fn failure(failure: &Failure) -> Failure {
     }
 }
 
-pub(crate) fn progress(progress: Progress) -> Progress {
+pub(crate) fn progress(progress: &Progress) -> Progress {
     Progress {
         stage: clean(&progress.stage, 64),
         message: clean(&progress.message, MAX_LOG_LINE_BYTES),
-        ..progress
+        ..*progress
     }
 }
 

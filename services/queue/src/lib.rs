@@ -1,4 +1,4 @@
-//! Job state machine and its two stores, Postgres and SQLite.
+//! Job state machine and its two stores, Postgres and `SQLite`.
 //!
 //! - [`state`]: the rules of a job's life, pure.
 //! - [`store`]: what a queue can do, as a trait with its types and errors.

@@ -16,7 +16,7 @@ use sqlx::{PgConnection, PgPool, Postgres, QueryBuilder, Transaction};
 use tokio::task::JoinSet;
 use uuid::Uuid;
 
-use crate::changes::Signal;
+use crate::changes::{Change, Signal};
 use crate::store::{Result, Settings, StoreError};
 
 #[path = "sql.rs"]
@@ -27,6 +27,8 @@ pub use sql::SqlStore as PostgresStore;
 const CHANNEL: &str = "ign_queue";
 /// Changes within this time are told once.
 const NOTIFY_PAUSE: Duration = Duration::from_millis(10);
+const JOB_WORD: &str = "job";
+const WORK_WORD: &str = "work";
 const MAX_CONNECTIONS: u32 = 24;
 
 static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("../../migrations/postgres");
@@ -125,10 +127,18 @@ pub(crate) async fn open(url: &str, settings: Settings) -> Result<PostgresStore>
 
 async fn tell_others(pool: PgPool, signal: Arc<Signal>, instance: String) {
     let mut own = signal.subscribe_own();
+    let mut told_work = own.borrow_and_update().work;
     while own.changed().await.is_ok() {
+        let work = own.borrow_and_update().work;
+        let word = if work == told_work {
+            JOB_WORD
+        } else {
+            WORK_WORD
+        };
+        told_work = work;
         let told = sqlx::query("select pg_notify($1, $2)")
             .bind(CHANNEL)
-            .bind(&instance)
+            .bind(format!("{word} {instance}"))
             .execute(&pool)
             .await;
         if let Err(error) = told {
@@ -143,7 +153,7 @@ async fn hear_others(pool: PgPool, signal: Arc<Signal>, instance: String) {
         match listen(&pool, &signal, &instance).await {
             Ok(never) => match never {},
             Err(error) => {
-                tracing::warn!(%error, "cannot hear of other coordinators' changes; polling until I can")
+                tracing::warn!(%error, "cannot hear of other coordinators' changes; polling until I can");
             }
         }
         tokio::time::sleep(Duration::from_secs(1)).await;
@@ -157,11 +167,18 @@ async fn listen(
 ) -> std::result::Result<std::convert::Infallible, sqlx::Error> {
     let mut listener = PgListener::connect_with(pool).await?;
     listener.listen(CHANNEL).await?;
+    // Between two connections something may have been missed.
+    signal.raise_foreign(Change::Work);
     loop {
-        match listener.try_recv().await? {
-            Some(notification) if notification.payload() == instance => {}
-            // Reconnected: something may have been missed.
-            Some(_) | None => signal.raise_foreign(),
+        let Some(notification) = listener.try_recv().await? else {
+            signal.raise_foreign(Change::Work);
+            continue;
+        };
+        match notification.payload().split_once(' ') {
+            Some((_, sender)) if sender == instance => {}
+            Some((JOB_WORD, _)) => signal.raise_foreign(Change::Job),
+            // Also what a newer version may say.
+            _ => signal.raise_foreign(Change::Work),
         }
     }
 }

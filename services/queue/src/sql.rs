@@ -20,7 +20,7 @@ use super::{
     ALIAS_LIST, Backend, Connection, Db, DbTime, LOCK, LOCK_FREE_ROWS, from_db, from_key, key,
     push_label, to_db,
 };
-use crate::changes::{Changes, Signal};
+use crate::changes::{Change, Changes, Signal};
 use crate::check;
 use crate::error::from_commit;
 use crate::state::{Checkpoint, Failure, Job, JobSpec, JobState, Level, Progress, Refusal};
@@ -33,7 +33,7 @@ use crate::waiting::{Rival, Surroundings, describe};
 
 type DbRow = <Db as sqlx::Database>::Row;
 
-/// Rows of one insert; a row has at most a dozen bound values, and SQLite takes 32,766 of them.
+/// Rows of one insert; a row has at most a dozen bound values, and `SQLite` takes 32,766 of them.
 const CHUNK: usize = 500;
 /// A worker's row is written again after this many seconds, so that idle workers cost reads only.
 const WORKER_FRESH_SECS: i64 = 5;
@@ -276,7 +276,7 @@ async fn append_logs(
         );
         insert.push_values(chunk, |mut row, line| {
             seq += 1;
-            let line = check::log_line(line.clone());
+            let line = check::log_line(line);
             row.push_bind(key(job))
                 .push_bind(seq)
                 .push_bind(to_db(line.at))
@@ -425,29 +425,39 @@ impl SqlStore {
         Ok((transaction, now))
     }
 
-    async fn commit(&self, transaction: Transaction<'static, Db>) -> Result<()> {
-        transaction.commit().await.map_err(from_commit)?;
-        self.signal.raise();
-        Ok(())
+    /// Commits what `outcome` says went well and tells of it; rolls back otherwise. Not left to the transaction's drop,
+    /// which only schedules the rollback: until then its locks would hide rows from claims.
+    async fn finish<T: Send>(
+        &self,
+        transaction: Transaction<'static, Db>,
+        outcome: Result<T>,
+        change: Change,
+    ) -> Result<T> {
+        if outcome.is_ok() {
+            transaction.commit().await.map_err(from_commit)?;
+            self.signal.raise(change);
+        } else if let Err(error) = transaction.rollback().await {
+            tracing::debug!(%error, "a rollback failed; the server does it when the connection closes");
+        }
+        outcome
     }
 
-    /// One transition of one job.
-    async fn change<T>(
+    /// One transition of one job on request of a user.
+    async fn change(
         &self,
         job: JobId,
-        transition: impl FnOnce(&mut Job, DateTime<Utc>) -> std::result::Result<T, Refusal> + Send,
-    ) -> Result<(Job, T)>
-    where
-        T: Send,
-    {
+        transition: impl FnOnce(&mut Job, DateTime<Utc>) -> std::result::Result<(), Refusal> + Send,
+    ) -> Result<Job> {
         let (mut transaction, now) = self.begin().await?;
-        let mut job = lock_job(&mut transaction, job).await?;
-        let attempt = job.attempt;
-        let outcome =
+        let outcome = async {
+            let mut job = lock_job(&mut transaction, job).await?;
+            let attempt = job.attempt;
             transition(&mut job, now).map_err(|refusal| refused(&job, attempt, refusal))?;
-        save_job(&mut transaction, &job).await?;
-        self.commit(transaction).await?;
-        Ok((job, outcome))
+            save_job(&mut transaction, &job).await?;
+            Ok(job)
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Work).await
     }
 
     /// Queues requests that were checked, sorted by their key so that concurrent batches lock in one order.
@@ -456,6 +466,7 @@ impl SqlStore {
         requests: &[(usize, JobId, Submit)],
     ) -> Result<Vec<(usize, Result<Job>)>> {
         let (mut transaction, now) = self.begin().await?;
+        let outcome = async {
         let mut names: Vec<&str> = requests
             .iter()
             .map(|(_, _, request)| request.spec.object.collection.as_str())
@@ -511,10 +522,13 @@ impl SqlStore {
             .build()
             .fetch_all(&mut *transaction)
             .await?;
-        self.commit(transaction).await?;
+        jobs_from(&rows)
+        }
+        .await;
+        let stored = self.finish(transaction, outcome, Change::Work).await?;
 
         let mut jobs = BTreeMap::new();
-        for job in jobs_from(&rows)? {
+        for job in stored {
             jobs.insert(
                 (job.spec.object.collection.clone(), job.request_id.clone()),
                 job,
@@ -595,6 +609,36 @@ impl SqlStore {
         .fetch_all(&mut *reader)
         .await?;
         rows.iter().map(|row| parse(row.try_get("name")?)).collect()
+    }
+
+    /// Takes back leases that ran out, at most [`REAP_BATCH`], and forgets workers that are long gone.
+    async fn reap_batch(&self) -> Result<Vec<Job>> {
+        let (mut transaction, now) = self.begin().await?;
+        let outcome = async {
+            let rows = sqlx::query(sql(format!(
+                "select {JOB} from jobs where state = 'leased' and lease_until <= $1 order by lease_until \
+                 limit {REAP_BATCH} {LOCK_FREE_ROWS}"
+            )))
+            .bind(to_db(now))
+            .fetch_all(&mut *transaction)
+            .await?;
+            let mut jobs = jobs_from(&rows)?;
+            for job in &mut jobs {
+                job.expire(now);
+                save_job(&mut transaction, job).await?;
+            }
+            sqlx::query("delete from workers where last_seen_at < $1")
+                .bind(to_db(now - seconds(WORKER_KEPT_SECS)))
+                .execute(&mut *transaction)
+                .await?;
+            Ok(jobs)
+        }
+        .await;
+        let change = match &outcome {
+            Ok(jobs) if !jobs.is_empty() => Change::Work,
+            _ => Change::Nothing,
+        };
+        self.finish(transaction, outcome, change).await
     }
 
     /// Leases the first job of a collection that nobody else is about to take.
@@ -702,6 +746,10 @@ impl Store for SqlStore {
 
     fn changes(&self) -> Changes {
         self.signal.subscribe()
+    }
+
+    fn work(&self) -> Changes {
+        self.signal.subscribe_work()
     }
 
     async fn ping(&self) -> Result<()> {
@@ -887,11 +935,11 @@ impl Store for SqlStore {
             job.cancel(now);
             Ok(())
         };
-        Ok(self.change(job, cancel).await?.0)
+        self.change(job, cancel).await
     }
 
     async fn retry(&self, job: JobId) -> Result<Job> {
-        Ok(self.change(job, Job::retry).await?.0)
+        self.change(job, Job::retry).await
     }
 
     async fn logs(&self, job: JobId, after_seq: u64, limit: u32) -> Result<Vec<LogLine>> {
@@ -972,16 +1020,24 @@ impl Store for SqlStore {
             return Ok(None);
         }
         let (mut transaction, now) = self.begin().await?;
-        for collection in &collections {
-            if let Some(job) = self
-                .claim(&mut transaction, collection, &worker.id, now)
-                .await?
-            {
-                self.commit(transaction).await?;
-                return Ok(Some(job));
+        let outcome = async {
+            for collection in &collections {
+                let claimed = self
+                    .claim(&mut transaction, collection, &worker.id, now)
+                    .await?;
+                if claimed.is_some() {
+                    return Ok(claimed);
+                }
             }
+            Ok(None)
         }
-        Ok(None)
+        .await;
+        let change = if matches!(outcome, Ok(Some(_))) {
+            Change::Job
+        } else {
+            Change::Nothing
+        };
+        self.finish(transaction, outcome, change).await
     }
 
     async fn heartbeat(
@@ -992,39 +1048,46 @@ impl Store for SqlStore {
         logs: Vec<NewLogLine>,
     ) -> Result<Orders> {
         let (mut transaction, now) = self.begin().await?;
-        let mut job = lock_job(&mut transaction, job).await?;
-        let cancel = job
-            .heartbeat(
-                attempt,
-                progress.map(check::progress),
-                now,
-                self.settings.lease,
+        let outcome = async {
+            let mut job = lock_job(&mut transaction, job).await?;
+            let cancel = job
+                .heartbeat(
+                    attempt,
+                    progress.as_ref().map(check::progress),
+                    now,
+                    self.settings.lease,
+                )
+                .map_err(|refusal| refused(&job, attempt, refusal))?;
+            save_job(&mut transaction, &job).await?;
+            append_logs(&mut transaction, job.id, attempt, logs).await?;
+            let drain: Option<bool> = sqlx::query_scalar(
+                "update workers set last_seen_at = $2 where id = $1 returning draining",
             )
-            .map_err(|refusal| refused(&job, attempt, refusal))?;
-        save_job(&mut transaction, &job).await?;
-        append_logs(&mut transaction, job.id, attempt, logs).await?;
-        let drain: Option<bool> = sqlx::query_scalar(
-            "update workers set last_seen_at = $2 where id = $1 returning draining",
-        )
-        .bind(job.worker.as_ref().map(WorkerId::as_str))
-        .bind(to_db(now))
-        .fetch_optional(&mut *transaction)
-        .await?;
-        self.commit(transaction).await?;
-        Ok(Orders {
-            cancel,
-            drain: drain.unwrap_or(false),
-        })
+            .bind(job.worker.as_ref().map(WorkerId::as_str))
+            .bind(to_db(now))
+            .fetch_optional(&mut *transaction)
+            .await?;
+            Ok(Orders {
+                cancel,
+                drain: drain.unwrap_or(false),
+            })
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Job).await
     }
 
     async fn checkpoint(&self, job: JobId, attempt: Attempt, checkpoint: Checkpoint) -> Result<()> {
         check::bytes("size_bytes", checkpoint.size_bytes)?;
         let (mut transaction, _now) = self.begin().await?;
-        let mut job = lock_job(&mut transaction, job).await?;
-        job.checkpointed(attempt, checkpoint)
-            .map_err(|refusal| refused(&job, attempt, refusal))?;
-        save_job(&mut transaction, &job).await?;
-        self.commit(transaction).await
+        let outcome = async {
+            let mut job = lock_job(&mut transaction, job).await?;
+            job.checkpointed(attempt, checkpoint)
+                .map_err(|refusal| refused(&job, attempt, refusal))?;
+            save_job(&mut transaction, &job).await?;
+            Ok(())
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Job).await
     }
 
     async fn publish_and_complete(
@@ -1035,6 +1098,7 @@ impl Store for SqlStore {
     ) -> Result<Version> {
         check::bundle(&bundle)?;
         let (mut transaction, now) = self.begin().await?;
+        let outcome = async {
         let mut job = lock_job(&mut transaction, job).await?;
         let object = job.spec.object.clone();
         if let (Some(version), true) = (job.version, job.attempt == attempt) {
@@ -1076,8 +1140,10 @@ impl Store for SqlStore {
             .map_err(|refusal| refused(&job, attempt, refusal))?;
         save_job(&mut transaction, &job).await?;
         let published = find_version(&mut transaction, &object, &format!("v{version}")).await?;
-        self.commit(transaction).await?;
         Ok(published)
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Work).await
     }
 
     async fn fail(
@@ -1088,56 +1154,37 @@ impl Store for SqlStore {
         logs: Vec<NewLogLine>,
     ) -> Result<bool> {
         let (mut transaction, now) = self.begin().await?;
-        let mut job = lock_job(&mut transaction, job).await?;
-        let will_retry = job
-            .fail(
-                attempt,
-                check::failure(&failure),
-                now,
-                &self.settings.backoff,
-            )
-            .map_err(|refusal| refused(&job, attempt, refusal))?;
-        save_job(&mut transaction, &job).await?;
-        append_logs(&mut transaction, job.id, attempt, logs).await?;
-        self.commit(transaction).await?;
-        Ok(will_retry)
+        let outcome = async {
+            let mut job = lock_job(&mut transaction, job).await?;
+            let will_retry = job
+                .fail(
+                    attempt,
+                    check::failure(&failure),
+                    now,
+                    &self.settings.backoff,
+                )
+                .map_err(|refusal| refused(&job, attempt, refusal))?;
+            save_job(&mut transaction, &job).await?;
+            append_logs(&mut transaction, job.id, attempt, logs).await?;
+            Ok(will_retry)
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Work).await
     }
 
     async fn reap(&self) -> Result<Reaped> {
         let mut reaped = Reaped::default();
         loop {
-            let (mut transaction, now) = self.begin().await?;
-            let rows = sqlx::query(sql(format!(
-                "select {JOB} from jobs where state = 'leased' and lease_until <= $1 order by lease_until \
-                 limit {REAP_BATCH} {LOCK_FREE_ROWS}"
-            )))
-            .bind(to_db(now))
-            .fetch_all(&mut *transaction)
-            .await?;
-            for mut job in jobs_from(&rows)? {
-                if job.expire(now) {
-                    save_job(&mut transaction, &job).await?;
-                    let list = if job.state == JobState::Queued {
-                        &mut reaped.requeued
-                    } else {
-                        &mut reaped.ended
-                    };
-                    list.push(job.id);
+            let batch = self.reap_batch().await?;
+            let full = batch.len() == REAP_BATCH;
+            for job in batch {
+                if job.state == JobState::Queued {
+                    reaped.requeued.push(job.id);
+                } else {
+                    reaped.ended.push(job.id);
                 }
             }
-            if rows.len() < REAP_BATCH {
-                sqlx::query("delete from workers where last_seen_at < $1")
-                    .bind(to_db(now - seconds(WORKER_KEPT_SECS)))
-                    .execute(&mut *transaction)
-                    .await?;
-            }
-            if rows.is_empty() {
-                // Nothing for others to see.
-                transaction.commit().await.map_err(from_commit)?;
-            } else {
-                self.commit(transaction).await?;
-            }
-            if rows.len() < REAP_BATCH {
+            if !full {
                 return Ok(reaped);
             }
         }
@@ -1151,18 +1198,22 @@ impl Store for SqlStore {
 
     async fn drain_worker(&self, worker: &WorkerId, draining: bool) -> Result<()> {
         let (mut transaction, _now) = self.begin().await?;
-        let done = sqlx::query("update workers set draining = $2 where id = $1")
-            .bind(worker.as_str())
-            .bind(draining)
-            .execute(&mut *transaction)
-            .await?;
-        if done.rows_affected() == 0 {
-            return Err(StoreError::NotFound {
-                kind: "worker",
-                name: worker.to_string(),
-            });
+        let outcome = async {
+            let done = sqlx::query("update workers set draining = $2 where id = $1")
+                .bind(worker.as_str())
+                .bind(draining)
+                .execute(&mut *transaction)
+                .await?;
+            if done.rows_affected() == 0 {
+                return Err(StoreError::NotFound {
+                    kind: "worker",
+                    name: worker.to_string(),
+                });
+            }
+            Ok(())
         }
-        self.commit(transaction).await
+        .await;
+        self.finish(transaction, outcome, Change::Work).await
     }
 
     async fn versions(&self, filter: &VersionFilter) -> Result<Vec<Version>> {
@@ -1198,21 +1249,25 @@ impl Store for SqlStore {
     ) -> Result<Version> {
         check::alias(alias)?;
         let (mut transaction, _now) = self.begin().await?;
-        lock_object(&mut transaction, object).await?;
-        let version = find_version(&mut transaction, object, reference).await?;
-        if version.retired {
-            return Err(StoreError::NotAllowed {
-                message: format!("{object}:v{} is retired", version.version),
-            });
+        let outcome = async {
+            lock_object(&mut transaction, object).await?;
+            let version = find_version(&mut transaction, object, reference).await?;
+            if version.retired {
+                return Err(StoreError::NotAllowed {
+                    message: format!("{object}:v{} is retired", version.version),
+                });
+            }
+            point_alias(&mut transaction, object, alias, version.version).await?;
+            let version = find_version(&mut transaction, object, alias).await?;
+            Ok(version)
         }
-        point_alias(&mut transaction, object, alias, version.version).await?;
-        let version = find_version(&mut transaction, object, alias).await?;
-        self.commit(transaction).await?;
-        Ok(version)
+        .await;
+        self.finish(transaction, outcome, Change::Job).await
     }
 
     async fn retire(&self, object: &ObjectName, reference: &str) -> Result<Version> {
         let (mut transaction, _now) = self.begin().await?;
+        let outcome = async {
         lock_object(&mut transaction, object).await?;
         let version = find_version(&mut transaction, object, reference).await?;
         if let Some(alias) = version.aliases.iter().find(|alias| *alias != "latest") {
@@ -1240,7 +1295,7 @@ impl Store for SqlStore {
             .await?;
             match newest {
                 Some(newest) => {
-                    point_alias(&mut transaction, object, "latest", small(newest)?).await?
+                    point_alias(&mut transaction, object, "latest", small(newest)?).await?;
                 }
                 None => {
                     sqlx::query("delete from aliases where collection = $1 and object = $2 and alias = 'latest'")
@@ -1253,8 +1308,10 @@ impl Store for SqlStore {
         }
         let version =
             find_version(&mut transaction, object, &format!("v{}", version.version)).await?;
-        self.commit(transaction).await?;
         Ok(version)
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Job).await
     }
 
     async fn collections(&self) -> Result<Vec<Collection>> {
@@ -1272,6 +1329,7 @@ impl Store for SqlStore {
     async fn set_collection(&self, collection: Collection) -> Result<Collection> {
         check::collection(&collection)?;
         let (mut transaction, _now) = self.begin().await?;
+        let outcome = async {
         sqlx::query(
             "insert into collections (name, weight, max_running, paused) values ($1, $2, $3, $4) \
              on conflict (name) do update set weight = excluded.weight, max_running = excluded.max_running, \
@@ -1283,7 +1341,9 @@ impl Store for SqlStore {
         .bind(collection.paused)
         .execute(&mut *transaction)
         .await?;
-        self.commit(transaction).await?;
         Ok(collection)
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Work).await
     }
 }

@@ -1,4 +1,4 @@
-//! The embedded store: SQLite, one process, one machine.
+//! The embedded store: `SQLite`, one process, one machine.
 //!
 //! Write-ahead log, so that readers never wait for the writer; one writing connection with `BEGIN IMMEDIATE`, so that a
 //! transaction never fails half-way for want of the lock. `synchronous = FULL`: an acknowledged submit survives a power
@@ -56,11 +56,7 @@ impl Backend {
         Ok(self.writer.begin_with("begin immediate").await?)
     }
 
-    #[expect(
-        clippy::unused_async,
-        clippy::unnecessary_wraps,
-        reason = "the other dialect asks its server"
-    )]
+    #[expect(clippy::unused_async, reason = "the other dialect asks its server")]
     async fn now(_connection: &mut Connection) -> Result<DateTime<Utc>> {
         static LAST: AtomicI64 = AtomicI64::new(0);
         let wall = Utc::now().timestamp_micros();
@@ -88,6 +84,10 @@ fn key(job: JobId) -> String {
     job.to_string()
 }
 
+#[expect(
+    clippy::needless_pass_by_value,
+    reason = "the other dialect's keys are values"
+)]
 fn from_key(key: String) -> Result<JobId> {
     key.parse().map_err(|error| StoreError::Internal {
         message: format!("{error}"),

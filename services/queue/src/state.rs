@@ -427,3 +427,180 @@ fn sane(mut progress: Progress) -> Progress {
     progress.error = progress.error.filter(|error| error.is_finite());
     progress
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LEASE: Duration = Duration::from_secs(45);
+    const BACKOFF: Backoff = Backoff {
+        base: Duration::from_secs(8),
+        cap: Duration::from_secs(20),
+    };
+
+    #[derive(Clone, Copy, Debug)]
+    enum Op {
+        Lease,
+        Heartbeat,
+        Complete,
+        Fail(FailureKind),
+        Expire,
+        Cancel,
+        Retry,
+        StaleHeartbeat,
+        StaleComplete,
+        StaleFail,
+    }
+
+    const OPS: [Op; 13] = [
+        Op::Lease,
+        Op::Heartbeat,
+        Op::Complete,
+        Op::Fail(FailureKind::Transient),
+        Op::Fail(FailureKind::Crashed),
+        Op::Fail(FailureKind::InvalidInput),
+        Op::Fail(FailureKind::Cancelled),
+        Op::Expire,
+        Op::Cancel,
+        Op::Retry,
+        Op::StaleHeartbeat,
+        Op::StaleComplete,
+        Op::StaleFail,
+    ];
+
+    fn job() -> Job {
+        let spec = JobSpec {
+            object: "museum/vase".parse().unwrap(),
+            capture_digest: Digest::from_sha256([1; 32]),
+            recipe_json: "{}".to_owned(),
+            priority: 0,
+            labels: BTreeMap::new(),
+            max_attempts: 2,
+        };
+        Job::submit(
+            JobId::generate(),
+            "r".to_owned(),
+            spec,
+            DateTime::UNIX_EPOCH,
+        )
+    }
+
+    fn failure(kind: FailureKind) -> Failure {
+        Failure {
+            kind,
+            message: "no".to_owned(),
+            at: String::new(),
+            hint: String::new(),
+        }
+    }
+
+    /// Applies one operation an hour after the last, when every lease and back-off has ended.
+    fn apply(job: &mut Job, op: Op, now: DateTime<Utc>) -> bool {
+        let current = job.attempt;
+        let stale = Attempt(job.attempt.0 - 1);
+        match op {
+            Op::Lease => job.lease("w".parse().unwrap(), now, LEASE).is_ok(),
+            Op::Heartbeat => job.heartbeat(current, None, now, LEASE).is_ok(),
+            Op::Complete => job.complete(current, 1, now).is_ok(),
+            Op::Fail(kind) => job.fail(current, failure(kind), now, &BACKOFF).is_ok(),
+            Op::Expire => job.expire(now),
+            Op::Cancel => {
+                job.cancel(now);
+                true
+            }
+            Op::Retry => job.retry(now).is_ok(),
+            Op::StaleHeartbeat => job.heartbeat(stale, None, now, LEASE).is_ok(),
+            Op::StaleComplete => job.complete(stale, 1, now).is_ok(),
+            Op::StaleFail => job
+                .fail(stale, failure(FailureKind::Crashed), now, &BACKOFF)
+                .is_ok(),
+        }
+    }
+
+    /// Every sequence of operations up to `depth`, from a fresh job.
+    fn explore(
+        job: &Job,
+        depth: u32,
+        now: DateTime<Utc>,
+        seen: &mut std::collections::HashSet<JobState>,
+    ) {
+        seen.insert(job.state);
+        if depth == 0 {
+            return;
+        }
+        let now = now + Duration::from_hours(1);
+        for op in OPS {
+            let mut next = job.clone();
+            let done = apply(&mut next, op, now);
+            next.check()
+                .unwrap_or_else(|rule| panic!("{rule}: {op:?} on {job:?}"));
+            assert!(next.attempt >= job.attempt, "attempts never go back");
+            if !done {
+                assert_eq!(&next, job, "a refused {op:?} changed something");
+            }
+            if matches!(op, Op::StaleHeartbeat | Op::StaleComplete | Op::StaleFail) {
+                assert!(!done, "a stale attempt was obeyed: {op:?} on {job:?}");
+            }
+            if matches!(op, Op::Lease) && done {
+                assert!(job.worker.is_none(), "leased twice");
+            }
+            if job.state == JobState::Leased && next.state == JobState::Queued {
+                assert_eq!(
+                    next.attempt.0,
+                    job.attempt.0 + 1,
+                    "the next attempt has its own number"
+                );
+            }
+            if job.state == JobState::Succeeded {
+                assert_eq!(&next, job, "success is final");
+            }
+            explore(&next, depth - 1, now, seen);
+        }
+    }
+
+    #[test]
+    fn every_sequence_of_operations_keeps_the_rules() {
+        let mut seen = std::collections::HashSet::new();
+        explore(&job(), 5, DateTime::UNIX_EPOCH, &mut seen);
+        assert_eq!(seen.len(), JobState::ALL.len());
+    }
+
+    #[test]
+    fn backoff_doubles_up_to_its_cap_with_jitter_of_at_most_half() {
+        let mut distinct = std::collections::HashSet::new();
+        for _ in 0..200 {
+            let id = JobId::generate();
+            for (attempt, full) in [(1, 8), (2, 16), (3, 20), (4, 20), (u32::MAX, 20)] {
+                let delay = BACKOFF.delay(id, Attempt(attempt));
+                assert_eq!(delay, BACKOFF.delay(id, Attempt(attempt)));
+                assert!(
+                    delay <= Duration::from_secs(full) && delay >= Duration::from_secs(full) / 2
+                );
+                distinct.insert(delay);
+            }
+        }
+        assert!(
+            distinct.len() > 900,
+            "jobs that failed together come back together"
+        );
+    }
+
+    #[test]
+    fn a_lease_is_not_taken_before_its_time_and_not_shortened() {
+        let mut job = job();
+        let now = DateTime::UNIX_EPOCH;
+        job.not_before = now + Duration::from_secs(1);
+        assert_eq!(
+            job.lease("w".parse().unwrap(), now, LEASE),
+            Err(Refusal::NotYet)
+        );
+        job.lease("w".parse().unwrap(), now + Duration::from_secs(1), LEASE)
+            .unwrap();
+        let until = job.lease_until;
+        // A clock that was set back.
+        job.heartbeat(Attempt(1), None, now, LEASE).unwrap();
+        assert_eq!(job.lease_until, until);
+        assert!(!job.expire(now + LEASE));
+        assert!(job.expire(now + LEASE + Duration::from_secs(1)));
+    }
+}

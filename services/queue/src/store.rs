@@ -313,6 +313,10 @@ pub trait Store: Send + Sync + std::fmt::Debug + 'static {
     /// Registers interest in changes from now on: call it before the query whose answer is to be watched.
     fn changes(&self) -> Changes;
 
+    /// The same for those changes alone after which [`Store::lease`] may give more than before: heartbeats and progress
+    /// do not wake workers that wait for jobs.
+    fn work(&self) -> Changes;
+
     /// Whether the database answers.
     async fn ping(&self) -> Result<()>;
 
