@@ -191,7 +191,7 @@ async fn start_coordinator(
         store: StoreConfig::new(format!("file://{}", text(&data.join("store"))?)),
         token_file: token_file.to_path_buf(),
         endpoint_file: Some(data.join("endpoint.json")),
-        settings: Default::default(),
+        settings: ign_queue::Settings::default(),
         redirect_blobs: false,
     };
     let shutdown = async {
