@@ -75,7 +75,7 @@ def run_tests():
     say("$ " + " ".join(command))
     passed = failed = 0
     # Idle OpenMP threads of parallel tests would spin against each other.
-    env = {"OMP_NUM_THREADS": "1", **os.environ}
+    env = {"OMP_NUM_THREADS": "1", "RUST_LIB_BACKTRACE": "0", **os.environ}
     with subprocess.Popen(command, cwd=ROOT, env=env, stdout=subprocess.PIPE, text=True, errors="replace") as tests:
         for line in tests.stdout:
             print(line, end="", flush=True)

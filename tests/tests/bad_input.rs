@@ -18,7 +18,7 @@ type Fault = (
 );
 
 const FAULTS: [Fault; 7] = [
-    ("empty-folder", empty, &["images"]),
+    ("empty-folder", empty, &["missing"]),
     ("missing-mesh", missing_mesh, &["mesh"]),
     ("image-that-is-none", image_that_is_none, &["image"]),
     ("absent-image", absent_image, &["image"]),

@@ -1,6 +1,5 @@
 //! Twelve objects, three workers, Postgres and S3: a worker and the coordinator are killed, and nothing is lost.
 
-use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::fs;
 use std::time::Duration;
@@ -101,16 +100,6 @@ fn twelve_objects_survive_a_killed_worker_and_a_killed_coordinator() -> Result<(
             job.0
         );
     }
-    let workers: BTreeSet<&str> = jobs
-        .iter()
-        .map(Job::worker)
-        .filter(|name| !name.is_empty())
-        .collect();
-    ensure!(
-        !workers.contains(killed.as_str()) || workers.len() > 1,
-        "only {workers:?} worked"
-    );
-
     // The killed job went on from its checkpoint.
     let long = client.job(long.id())?;
     ensure!(
@@ -118,6 +107,7 @@ fn twelve_objects_survive_a_killed_worker_and_a_killed_coordinator() -> Result<(
         "the killed job took {} attempts",
         long.attempt()
     );
+    ensure!(long.worker() != killed, "the dead worker ended it");
     let step = resumed_step(&client.logs(long.id())?)?;
     ensure!(step > 0, "the killed job began again");
 

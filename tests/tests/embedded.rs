@@ -76,7 +76,7 @@ fn kill_of_everything_loses_nothing() -> Result<()> {
     let resumed = log
         .lines()
         .rfind(|line| line.contains("resumed at step"))
-        .context("no attempt resumed")?;
+        .with_context(|| format!("no attempt resumed:\n{log}"))?;
     ensure!(
         !resumed.contains("resumed at step 0 "),
         "the killed job began again: {resumed}"
