@@ -327,7 +327,10 @@ impl Live {
 
     /// A bar of percent with a message behind it.
     pub(crate) fn percent() -> Self {
-        Self::new(ProgressBar::new(1000), style("{prefix:>12} {bar:28} {msg}"))
+        Self::new(
+            ProgressBar::new(1000),
+            style("{prefix:>12} {bar:28} {wide_msg}"),
+        )
     }
 
     /// Adds bytes to a transfer.
