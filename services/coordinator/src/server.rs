@@ -56,7 +56,8 @@ const MAX_STREAMS: u32 = 1024;
 /// A peer that vanished is noticed after the sum of both.
 const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(15);
 const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(15);
-const HEADER_TIMEOUT: Duration = Duration::from_secs(30);
+/// Longer than clients keep idle connections (reqwest: 90 s), or they would send into one that is closing.
+const HEADER_TIMEOUT: Duration = Duration::from_mins(2);
 const STREAM_WINDOW: u32 = 1024 * 1024;
 const CONNECTION_WINDOW: u32 = 8 * 1024 * 1024;
 /// How long running requests may take to end.

@@ -40,7 +40,7 @@ impl Workers for WorkersApi {
             .unwrap_or_default()
             .min(MAX_WAIT);
         let deadline = Instant::now() + wait;
-        let mut changes = self.0.store.changes();
+        let mut changes = self.0.store.work();
         loop {
             // In a task of its own: a client that leaves in the middle must not cut a claim in two.
             let claim = trace::spawn({
