@@ -6,7 +6,9 @@
 use std::collections::BTreeMap;
 use std::future::Future;
 use std::net::{SocketAddr, TcpListener};
-use std::path::Path;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::thread::JoinHandle;
 
@@ -72,12 +74,16 @@ pub async fn serve(
     }
 }
 
+/// Removes the folder when the test process ends, in whatever way: then the pipe on stdin closes.
+const JANITOR: &str = r#"read -r _; rm -rf "$1""#;
+
 /// An endpoint inside the test process, on a thread of its own; stopped and removed when dropped.
 #[derive(Debug)]
 pub struct S3 {
     address: SocketAddr,
     credentials: Credentials,
-    root: tempfile::TempDir,
+    root: PathBuf,
+    janitor: Child,
     stop: Option<oneshot::Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -88,8 +94,15 @@ impl S3 {
 
     /// Starts an endpoint on a free loopback port, with an empty bucket.
     pub fn start() -> Result<Self> {
-        let root = tempfile::Builder::new().prefix("ign-s3-").tempdir()?;
-        std::fs::create_dir(root.path().join(Self::BUCKET))?;
+        let root = tempfile::Builder::new().prefix("ign-s3-").tempdir()?.keep();
+        let janitor = Command::new("sh")
+            .args(["-c", JANITOR, "s3-janitor"])
+            .arg(&root)
+            .current_dir("/")
+            .stdin(Stdio::piped())
+            .process_group(0)
+            .spawn()?;
+        std::fs::create_dir(root.join(Self::BUCKET))?;
         let listener = TcpListener::bind("127.0.0.1:0")?;
         listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
@@ -105,7 +118,7 @@ impl S3 {
         let thread = std::thread::Builder::new()
             .name("s3-endpoint".to_owned())
             .spawn({
-                let root = root.path().to_owned();
+                let root = root.clone();
                 let credentials = credentials.clone();
                 move || {
                     let stop = async {
@@ -121,6 +134,7 @@ impl S3 {
             address,
             credentials,
             root,
+            janitor,
             stop: Some(stop),
             thread: Some(thread),
         })
@@ -152,7 +166,7 @@ impl S3 {
 
     /// Folder that holds the buckets, to look at or to damage.
     pub fn root(&self) -> &Path {
-        self.root.path()
+        &self.root
     }
 
     /// The variables that point an AWS client (and `ign-coordinator`) here.
@@ -169,6 +183,8 @@ impl Drop for S3 {
         if let Some(thread) = self.thread.take() {
             thread.join().ok();
         }
+        drop(self.janitor.stdin.take());
+        self.janitor.wait().ok();
     }
 }
 

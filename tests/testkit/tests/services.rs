@@ -69,6 +69,9 @@ async fn s3_honours_conditional_create_and_refuses_a_wrong_key() {
             .await
             .is_err()
     );
+    let root = s3.root().to_owned();
+    drop(s3);
+    assert!(!root.exists());
 }
 
 #[tokio::test]
