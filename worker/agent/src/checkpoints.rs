@@ -2,7 +2,7 @@
 //! never sent, and one that cannot be sent is replaced by the next.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use ign_events::Level;
@@ -23,6 +23,7 @@ pub(crate) struct Checkpoints {
     newest: watch::Sender<Option<PathBuf>>,
     outbox: PathBuf,
     count: u32,
+    sending: Arc<Mutex<Option<PathBuf>>>,
     task: JoinHandle<()>,
 }
 
@@ -35,11 +36,13 @@ impl Checkpoints {
         outbox: PathBuf,
     ) -> Self {
         let (newest, offered) = watch::channel(None);
-        let task = tokio::spawn(run(control, data, state, offered));
+        let sending = Arc::default();
+        let task = tokio::spawn(run(control, data, state, offered, Arc::clone(&sending)));
         Self {
             newest,
             outbox,
             count: 0,
+            sending,
             task,
         }
     }
@@ -49,8 +52,11 @@ impl Checkpoints {
         self.count += 1;
         let kept = self.outbox.join(format!("checkpoint-{}", self.count));
         std::fs::hard_link(path, &kept)?;
-        if let Some(overtaken) = self.newest.send_replace(Some(kept)) {
-            // Sent already, or no longer worth it. A running upload has the file open or fails over to the newer.
+        let overtaken = self.newest.send_replace(Some(kept));
+        // What is on its way arrives, or a slow line would never save anything. Other older ones are not worth it.
+        if let Some(overtaken) = overtaken
+            && Some(&overtaken) != lock(&self.sending).as_ref()
+        {
             std::fs::remove_file(overtaken).ok();
         }
         Ok(())
@@ -77,6 +83,7 @@ async fn run(
     data: DataPlane,
     state: Arc<State>,
     mut offered: watch::Receiver<Option<PathBuf>>,
+    sending: Arc<Mutex<Option<PathBuf>>>,
 ) {
     let mut backoff = Backoff::default();
     // Of the checkpoint that is being sent.
@@ -86,7 +93,13 @@ async fn run(
             let Some(path) = offered.borrow_and_update().clone() else {
                 break;
             };
-            let problem = match send(&control, &data, &state, &path, &session).await {
+            *lock(&sending) = Some(path.clone());
+            let sent = send(&control, &data, &state, &path, &session).await;
+            *lock(&sending) = None;
+            if offered.has_changed().unwrap_or(false) || sent.is_ok() {
+                std::fs::remove_file(&path).ok();
+            }
+            let problem = match sent {
                 Ok(size_bytes) => {
                     let megabytes = size_bytes as f64 / 1e6;
                     state.log(
@@ -120,6 +133,10 @@ async fn run(
         }
         session = UploadSession::default();
     }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 enum Problem {

@@ -31,7 +31,8 @@ use crate::{Agent, logs};
 const EXIT_GRACE: Duration = Duration::from_secs(30);
 /// How long the last checkpoint of a crashed child may take to arrive before the crash is reported.
 const CHECKPOINT_GRACE: Duration = Duration::from_mins(1);
-/// Times that a bundle is sent again because the store lost a blob of it.
+/// Times that a bundle is sent again because the store lost a blob of it, or published again because the coordinator
+/// failed inside: the bake took too long to give its result up at once.
 const MAX_RESENDS: u32 = 3;
 const MAX_SUMMARY_BYTES: usize = 256 * 1024;
 
@@ -290,7 +291,7 @@ impl Job<'_> {
                     exit_by.get_or_insert(Instant::now() + EXIT_GRACE);
                 }
                 Event::Failed(failure) => {
-                    result.get_or_insert(Err(failure));
+                    result.get_or_insert(Err(self.without_paths(failure)));
                     exit_by.get_or_insert(Instant::now() + EXIT_GRACE);
                 }
             }
@@ -309,6 +310,19 @@ impl Job<'_> {
             self.finish(checkpoints, CHECKPOINT_GRACE).await;
         }
         Err(Ended::Failed(failure))
+    }
+
+    /// Names the capture's files as their owner does, not as they lie on this machine.
+    fn without_paths(&self, failure: Failure) -> Failure {
+        let capture = self.dir.join("capture").display().to_string();
+        let folder = format!("{capture}/");
+        let relative = |text: &str| text.replace(&folder, "").replace(&capture, "capture");
+        Failure {
+            kind: failure.kind,
+            message: relative(&failure.message),
+            at: relative(&failure.at),
+            hint: relative(&failure.hint),
+        }
     }
 
     /// Lets the last checkpoint arrive, unless the job is no longer ours.
@@ -366,6 +380,7 @@ impl Job<'_> {
         request: v1::CompleteRequest,
         backoff: &mut Backoff,
     ) -> Result<Completed, Ended> {
+        let mut internal_errors = 0;
         loop {
             // Never dropped before its answer: a heartbeat that comes after the commit hears that the lease is over,
             // and would make a success look like a lost lease.
@@ -381,7 +396,12 @@ impl Job<'_> {
                 Cause::NotAllowed { reason, message } if reason == "BLOB_MISSING" => {
                     return Ok(Completed::BlobMissing(message));
                 }
-                cause if cause.retryable() => {
+                cause
+                    if cause.retryable()
+                        || (matches!(cause, Cause::Internal { .. })
+                            && internal_errors < MAX_RESENDS) =>
+                {
+                    internal_errors += u32::from(matches!(cause, Cause::Internal { .. }));
                     self.note(&format!("cannot publish yet: {cause}"));
                     let wait = cause.retry_after().unwrap_or_default();
                     let pause = tokio::time::sleep(backoff.next_delay().max(wait));

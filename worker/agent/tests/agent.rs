@@ -1,14 +1,18 @@
 //! The whole agent against a coordinator that breaks on demand, with a child that plays scripts.
 
-mod support;
+#[path = "support/fake.rs"]
+mod fake;
+#[path = "support/worker.rs"]
+mod worker;
 
 use std::time::Duration;
 
+use fake::{Coordinator, End};
 use ign_agent::AgentError;
 use ign_proto::v1::FailureKind;
 use serde_json::json;
-use support::{Coordinator, End, Worker, alive, config};
 use tokio_util::sync::CancellationToken;
+use worker::{Worker, alive, config};
 
 const SMALL: &[(&str, &[u8])] = &[("mesh.ply", b"ply"), ("images/1.png", b"one")];
 
@@ -40,7 +44,7 @@ async fn a_capture_becomes_a_bundle() {
         {"progress": 40.0}, {"sleep_ms": 800}, {"done": 10}
     ]);
     let job = coordinator.queue(&capture, &script);
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     let request = completed(coordinator.end_of(&job).await);
     let paths: Vec<&str> = request.files.iter().map(|file| &*file.path).collect();
     assert_eq!(
@@ -97,7 +101,7 @@ async fn broken_downloads_go_on_where_they_stopped() {
     let capture = coordinator.add_capture(&[("large.txt", &large)]);
     coordinator.world().cut_downloads.extend([300_000, 200_000]);
     let job = coordinator.queue(&capture, &json!([{"done": 1}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     completed(coordinator.end_of(&job).await);
     let ranges: Vec<String> = coordinator
         .world()
@@ -119,7 +123,7 @@ async fn broken_uploads_go_on_where_they_stopped() {
         world.lose_patch_answers = 1;
     }
     let job = coordinator.queue(&capture, &json!([{"done": 10_000_000}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     let request = completed(coordinator.end_of(&job).await);
     assert_eq!(
         coordinator.world().blobs[&request.files[2].digest].len(),
@@ -148,7 +152,7 @@ async fn blobs_that_the_store_lost_are_sent_again() {
     let capture = coordinator.add_capture(SMALL);
     coordinator.world().blob_missing_answers = 1;
     let job = coordinator.queue(&capture, &json!([{"done": 5}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     completed(coordinator.end_of(&job).await);
     worker.stop().await;
 }
@@ -162,7 +166,7 @@ async fn a_crash_is_reported_and_the_next_attempt_resumes() {
         {"checkpoint": "epoch 2"}, {"eprint": "terminate called"}, {"abort": true}
     ]);
     let job = coordinator.queue(&capture, &script);
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     let failure = failed(coordinator.end_of(&job).await);
     assert_eq!(failure.kind(), FailureKind::Crashed);
     assert_eq!(
@@ -216,7 +220,7 @@ async fn bad_captures_fail_at_once_and_the_worker_goes_on() {
     let clash = coordinator.add_capture(&[("a", b"file"), ("a/b", b"below it")]);
     let clash = coordinator.queue(&clash, &json!([]));
     let good = coordinator.queue(&capture, &json!([{"done": 5}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     completed(coordinator.end_of(&good).await);
 
     let failure = failed(coordinator.end_of(&refused).await);
@@ -249,7 +253,7 @@ async fn damaged_blobs_never_reach_a_bake() {
     let capture = coordinator.add_capture(SMALL);
     coordinator.world().damage = true;
     let job = coordinator.queue(&capture, &json!([{"done": 5}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     let failure = failed(coordinator.end_of(&job).await);
     assert_eq!(failure.kind(), FailureKind::Transient);
     assert!(failure.message.contains("arrived damaged"), "{failure:?}");
@@ -261,7 +265,7 @@ async fn cancel_kills_the_child() {
     let coordinator = Coordinator::start().await;
     let capture = coordinator.add_capture(SMALL);
     let job = coordinator.queue(&capture, &json!([{"sleep_ms": 600_000}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     coordinator
         .until("start", |world| world.log_after("pid ").is_some())
         .await;
@@ -279,7 +283,7 @@ async fn a_lost_lease_ends_everything_about_the_job() {
     let coordinator = Coordinator::start().await;
     let capture = coordinator.add_capture(SMALL);
     let lost = coordinator.queue(&capture, &json!([{"sleep_ms": 600_000}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     coordinator
         .until("start", |world| world.log_after("pid ").is_some())
         .await;
@@ -298,7 +302,7 @@ async fn a_bake_outlives_an_absent_coordinator() {
     let capture = coordinator.add_capture(SMALL);
     let script = json!([{"sleep_ms": 1000}, {"checkpoint": "c"}, {"print": "still here"}, {"done": 6_000_000}]);
     let job = coordinator.queue(&capture, &script);
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     coordinator
         .until("start", |world| world.log_after("pid ").is_some())
         .await;
@@ -318,7 +322,7 @@ async fn a_shutdown_hands_the_job_back_with_its_checkpoint() {
     let script =
         json!([{"checkpoint": "epoch 7"}, {"print": "checkpointed"}, {"sleep_ms": 600_000}]);
     let job = coordinator.queue(&capture, &script);
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     coordinator
         .until("checkpoint", |world| {
             world.log_after("checkpointed").is_some()
@@ -340,7 +344,7 @@ async fn a_shutdown_ends_even_when_nobody_answers() {
     let coordinator = Coordinator::start().await;
     let capture = coordinator.add_capture(SMALL);
     coordinator.queue(&capture, &json!([{"sleep_ms": 600_000}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     coordinator
         .until("start", |world| world.log_after("pid ").is_some())
         .await;
@@ -357,7 +361,7 @@ async fn a_drained_worker_finishes_its_job_and_ends() {
     coordinator.world().drain = true;
     let job = coordinator.queue(&capture, &json!([{"sleep_ms": 800}, {"done": 5}]));
     let waiting = coordinator.queue(&capture, &json!([{"done": 5}]));
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     completed(coordinator.end_of(&job).await);
     worker.task.await.unwrap().unwrap();
     assert_eq!(coordinator.world().queue[0].job_id, waiting);
@@ -369,24 +373,24 @@ async fn what_a_person_must_repair_ends_the_agent() {
     let dir = tempfile::tempdir().unwrap();
     let run = |config| ign_agent::run(config, CancellationToken::new());
 
-    let mut wrong = config(&coordinator, dir.path());
+    let mut wrong = config(&coordinator.url, dir.path());
     wrong.token = "wrong".into();
     let error = run(wrong).await.unwrap_err();
     assert!(matches!(error, AgentError::Refused { .. }), "{error}");
 
-    let mut wrong = config(&coordinator, dir.path());
+    let mut wrong = config(&coordinator.url, dir.path());
     wrong.server = "coordinator:7400".into();
     let error = run(wrong).await.unwrap_err();
     assert!(matches!(error, AgentError::Server { .. }), "{error}");
 
-    let mut wrong = config(&coordinator, dir.path());
+    let mut wrong = config(&coordinator.url, dir.path());
     wrong.name = Some("../x".into());
     let error = run(wrong).await.unwrap_err();
     assert!(matches!(error, AgentError::Name { .. }), "{error}");
 
-    let worker = Worker::start(&coordinator);
+    let worker = Worker::start(&coordinator.url);
     tokio::time::sleep(Duration::from_millis(300)).await;
-    let error = run(config(&coordinator, worker.dir.path()))
+    let error = run(config(&coordinator.url, worker.dir.path()))
         .await
         .unwrap_err();
     assert!(matches!(error, AgentError::WorkDirInUse { .. }), "{error}");
@@ -401,7 +405,7 @@ async fn leftovers_of_a_killed_agent_are_removed() {
     std::fs::write(dir.path().join("jobs/old.1/capture/mesh.ply"), "x").unwrap();
     let shutdown = CancellationToken::new();
     let task = tokio::spawn(ign_agent::run(
-        config(&coordinator, dir.path()),
+        config(&coordinator.url, dir.path()),
         shutdown.clone(),
     ));
     tokio::time::sleep(Duration::from_millis(300)).await;

@@ -3,6 +3,13 @@
 //! The recipe is `{"script": [step, ...]}`; see `main` for the steps. Like the real child it exits when its stdin
 //! reaches its end.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "a test program: panicking and printing are what it is for"
+)]
+
 use std::io::{Read, Write};
 use std::path::Path;
 
@@ -77,11 +84,16 @@ fn main() {
                 std::thread::sleep(std::time::Duration::from_millis(value.as_u64().unwrap()));
             }
             "abort" => std::process::abort(),
+            "abort_unless_resumed" => {
+                if job.checkpoint.is_none() {
+                    std::process::abort();
+                }
+            }
             "exit" => std::process::exit(value.as_i64().unwrap() as i32),
             "fail" => emit(&Event::Failed(Failure {
                 kind: FailureKind::InvalidInput,
                 message: text.to_owned(),
-                at: "sparse/cameras.txt:7".into(),
+                at: format!("{}/sparse/cameras.txt:7", job.capture_dir.display()),
                 hint: "re-export with PINHOLE".into(),
             })),
             "done" => {

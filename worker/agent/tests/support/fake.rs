@@ -1,22 +1,21 @@
 //! A coordinator in memory that breaks on demand, and an agent working for it.
 
+#![expect(clippy::unwrap_used, reason = "a panic is how a test fails")]
+
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
+use crate::worker::TOKEN;
 use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Path, Query, Request, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{any, get};
-use ign_agent::{AgentConfig, AgentError, ChildCommand};
 use ign_proto::v1::workers_server::{Workers, WorkersServer};
 use ign_proto::{Cause, Digest, FileEntry, JobId, Kind, Manifest, v1};
-use tokio::task::JoinHandle;
-use tokio_util::sync::CancellationToken;
 
-pub(crate) const TOKEN: &str = "secret";
 const LEASE_SECS: f64 = 1.0;
 
 /// How an attempt ended, as the coordinator heard it.
@@ -435,57 +434,6 @@ impl Workers for Coordinator {
             .push((job, End::Failed(request.failure.unwrap())));
         Ok(tonic::Response::new(v1::FailResponse { will_retry: false }))
     }
-}
-
-pub(crate) struct Worker {
-    pub(crate) dir: tempfile::TempDir,
-    pub(crate) shutdown: CancellationToken,
-    pub(crate) task: JoinHandle<Result<(), AgentError>>,
-}
-
-pub(crate) fn config(coordinator: &Coordinator, dir: &std::path::Path) -> AgentConfig {
-    AgentConfig {
-        name: Some("tester".into()),
-        threads: 3,
-        child: ChildCommand {
-            program: env!("CARGO_BIN_EXE_ign-agent-test-child").into(),
-            args: vec!["exec".into(), "--job".into()],
-            envs: Vec::new(),
-        },
-        shutdown_grace: Duration::from_secs(5),
-        lease_wait: Duration::from_secs(1),
-        ..AgentConfig::new(&coordinator.url, TOKEN, dir).unwrap()
-    }
-}
-
-impl Worker {
-    pub(crate) fn start(coordinator: &Coordinator) -> Self {
-        let dir = tempfile::tempdir().unwrap();
-        let shutdown = CancellationToken::new();
-        let task = tokio::spawn(ign_agent::run(
-            config(coordinator, dir.path()),
-            shutdown.clone(),
-        ));
-        Self {
-            dir,
-            shutdown,
-            task,
-        }
-    }
-
-    /// Stops the agent and checks that it left no job behind.
-    pub(crate) async fn stop(self) {
-        self.shutdown.cancel();
-        self.task.await.unwrap().unwrap();
-        let jobs = std::fs::read_dir(self.dir.path().join("jobs")).unwrap();
-        assert_eq!(jobs.count(), 0);
-    }
-}
-
-/// Whether a process exists and is no zombie.
-pub(crate) fn alive(pid: &str) -> bool {
-    let state = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
-    !state.is_empty() && !state.contains(") Z ")
 }
 
 impl World {
