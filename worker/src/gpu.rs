@@ -80,7 +80,7 @@ pub(crate) fn check() -> Result<String> {
     let sum = Tensor::f_ones([64, 64], (Kind::Float, device))
         .and_then(|ones| ones.f_matmul(&ones))
         .and_then(|product| product.f_sum(Kind::Float))
-        .and_then(|sum| f64::try_from(sum))
+        .and_then(f64::try_from)
         .context("the device does not compute")?;
     ensure!(
         (sum - 262_144.0).abs() < 1.0,

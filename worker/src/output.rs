@@ -1,10 +1,6 @@
 //! The only place that prints: data on stdout; progress, warnings and errors on stderr.
 
-#![expect(
-    clippy::print_stdout,
-    clippy::print_stderr,
-    reason = "this module is the program's voice"
-)]
+#![expect(clippy::print_stderr, reason = "this module is the program's voice")]
 
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};

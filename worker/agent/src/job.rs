@@ -291,7 +291,7 @@ impl Job<'_> {
                     exit_by.get_or_insert(Instant::now() + EXIT_GRACE);
                 }
                 Event::Failed(failure) => {
-                    result.get_or_insert(Err(self.without_paths(failure)));
+                    result.get_or_insert(Err(self.without_paths(&failure)));
                     exit_by.get_or_insert(Instant::now() + EXIT_GRACE);
                 }
             }
@@ -313,7 +313,7 @@ impl Job<'_> {
     }
 
     /// Names the capture's files as their owner does, not as they lie on this machine.
-    fn without_paths(&self, failure: Failure) -> Failure {
+    fn without_paths(&self, failure: &Failure) -> Failure {
         let capture = self.dir.join("capture").display().to_string();
         let folder = format!("{capture}/");
         let relative = |text: &str| text.replace(&folder, "").replace(&capture, "capture");

@@ -1,4 +1,4 @@
-//! The agent against the real coordinator, in this process, with SQLite and a local store.
+//! The agent against the real coordinator, in this process, with `SQLite` and a local store.
 
 #![expect(clippy::unwrap_used, reason = "a panic is how a test fails")]
 
@@ -166,7 +166,7 @@ impl Service {
                 return state;
             }
             assert!(
-                started.elapsed() < Duration::from_secs(60),
+                started.elapsed() < Duration::from_mins(1),
                 "no {what}: {state:?}"
             );
             tokio::time::sleep(Duration::from_millis(50)).await;
