@@ -15,15 +15,14 @@ const LOG_TAIL: usize = 60;
 
 /// A program of the workspace: in `IGN_BIN_DIR`, or where cargo puts it beside the tests.
 pub fn program(name: &str) -> Result<PathBuf> {
-    let dir = match std::env::var_os("IGN_BIN_DIR") {
-        Some(dir) => PathBuf::from(dir),
-        None => {
-            let test = std::env::current_exe()?;
-            test.ancestors()
-                .nth(2)
-                .context("the test lies in no target folder")?
-                .to_owned()
-        }
+    let dir = if let Some(dir) = std::env::var_os("IGN_BIN_DIR") {
+        PathBuf::from(dir)
+    } else {
+        let test = std::env::current_exe()?;
+        test.ancestors()
+            .nth(2)
+            .context("the test lies in no target folder")?
+            .to_owned()
     };
     let path = dir.join(name);
     ensure!(
