@@ -20,7 +20,7 @@ PRESET = standard
 OUT =
 ARGS =
 # The demo finishes within four minutes on two cores.
-DEMO_ARGS = --size 128 --budget-secs 120
+DEMO_ARGS = --size 128 --budget-secs 90
 
 bake: build
 	@set -eu; bin=$(BIN); capture='$(CAPTURE)'; object='$(OBJECT)'; out='$(OUT)'; limits=; \
