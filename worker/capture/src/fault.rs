@@ -156,3 +156,18 @@ impl Faults {
         self.list
     }
 }
+
+/// An error with what caused it, in one line and without a full stop.
+pub(crate) fn error_chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(inner) = source {
+        let inner_text = inner.to_string();
+        if !text.contains(&inner_text) {
+            text = format!("{text}: {inner_text}");
+        }
+        source = inner.source();
+    }
+    // Decoders end their messages with a full stop; ours go on behind them.
+    text.trim_end_matches('.').to_owned()
+}

@@ -10,15 +10,18 @@
 //!
 //! The folder's layout is described in the README beside this crate.
 
-mod colmap;
 mod distortion;
 mod fault;
 mod frame;
 mod import;
 mod photo;
+mod photographs;
+mod proxy;
+mod reconstruction;
 mod resample;
 mod scene;
 mod settings;
+mod sight;
 mod split;
 
 pub use distortion::{CameraModel, SourceCamera};

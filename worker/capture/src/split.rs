@@ -3,6 +3,13 @@
 //! The camera path is the order of names, with runs of digits compared as numbers.
 
 use std::cmp::Ordering;
+use std::collections::BTreeSet;
+use std::io;
+use std::path::Path;
+
+use crate::fault::Faults;
+use crate::reconstruction::ModelImage;
+use crate::settings::{self, Settings};
 
 /// One view of this many is held out where the capture names none.
 const EVERY: usize = 8;
@@ -10,7 +17,7 @@ const EVERY: usize = 8;
 /// The views, out of `count` in path order, that are held out by default. The first one is from the middle of the
 /// first run, so that the ends of the path stay with the training views. With 3 to 7 views one is held out, with
 /// fewer none.
-pub(crate) fn every_eighth(count: usize) -> Vec<usize> {
+fn every_eighth(count: usize) -> Vec<usize> {
     match count {
         0..3 => Vec::new(),
         3..EVERY => vec![count / 2],
@@ -48,6 +55,141 @@ fn take_digits<'a>(rest: &mut &'a [u8]) -> &'a [u8] {
     *rest = behind;
     let zeros = digits.iter().take_while(|&&b| b == b'0').count();
     &digits[zeros..]
+}
+
+/// File with the names of the held-out views.
+const HELD_OUT_FILE: &str = "test.txt";
+
+/// Fewest views that something can be learned from.
+const FEWEST_TRAINING_VIEWS: usize = 2;
+
+/// Names of held-out views that the model has; `None` where the capture names none.
+pub(crate) fn held_out_names(
+    dir: &Path,
+    settings: &Settings,
+    registered: &[&ModelImage],
+    model_is_whole: bool,
+    faults: &mut Faults,
+) -> Option<BTreeSet<String>> {
+    let from_file = read_held_out(dir, faults);
+    let listed = match (from_file, &settings.held_out) {
+        (Some(file), Some(list)) => {
+            let names = |list: &[(String, usize)]| {
+                list.iter()
+                    .map(|(name, _)| name.clone())
+                    .collect::<BTreeSet<_>>()
+            };
+            if names(&file) != names(list) {
+                faults.error(
+                    format!(
+                        "held-out views are named by {HELD_OUT_FILE} and {} and differ",
+                        settings::FILE_NAME
+                    ),
+                    HELD_OUT_FILE,
+                    "keep one of the two lists",
+                );
+            }
+            (file, HELD_OUT_FILE)
+        }
+        (Some(file), None) => (file, HELD_OUT_FILE),
+        (None, Some(list)) => (list.clone(), settings::FILE_NAME),
+        (None, None) => return None,
+    };
+    let (names, file) = listed;
+    if names.is_empty() {
+        faults.warning(
+            "the list of held-out views is empty; every eighth view is held out",
+            file,
+            "name some views, or remove the list",
+        );
+        return None;
+    }
+    let known: BTreeSet<&str> = registered.iter().map(|image| image.name.as_str()).collect();
+    let mut kept = BTreeSet::new();
+    for (name, line) in names {
+        let at = format!("{file}:{line}");
+        if known.contains(name.as_str()) {
+            kept.insert(name);
+        } else if !model_is_whole {
+            // It may well be in the part that could not be read.
+        } else if settings::is_inside(Path::new(&name)) && dir.join("images").join(&name).is_file()
+        {
+            faults.warning(
+                format!("held-out view {name} is not in the model and is left out"),
+                at,
+                "COLMAP did not register this photograph",
+            );
+        } else {
+            let alike = known
+                .iter()
+                .find(|other| Path::new(other).file_stem() == Path::new(&name).file_stem());
+            let hint = match alike {
+                Some(alike) => format!("is {alike} meant?"),
+                None => "names are those of the model's images, one per line".into(),
+            };
+            faults.error(format!("held-out view {name} is unknown"), at, hint);
+        }
+    }
+    Some(kept)
+}
+
+/// The lines of `test.txt` with their numbers.
+fn read_held_out(dir: &Path, faults: &mut Faults) -> Option<Vec<(String, usize)>> {
+    match std::fs::read_to_string(dir.join(HELD_OUT_FILE)) {
+        Ok(text) => {
+            let lines = text
+                .lines()
+                .zip(1..)
+                .map(|(line, number)| (line.trim().to_owned(), number));
+            Some(
+                lines
+                    .filter(|(line, _)| !line.is_empty() && !line.starts_with('#'))
+                    .collect(),
+            )
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => None,
+        Err(error) => {
+            faults.error(
+                format!("cannot read the file: {error}"),
+                HELD_OUT_FILE,
+                "one image name per line, UTF-8",
+            );
+            None
+        }
+    }
+}
+
+/// Indices of training and held-out views.
+pub(crate) fn split(
+    names: &[&str],
+    held_out: Option<&BTreeSet<String>>,
+) -> (Vec<usize>, Vec<usize>) {
+    let chosen: BTreeSet<usize> = match held_out {
+        Some(listed) => (0..names.len())
+            .filter(|&view| listed.contains(names[view]))
+            .collect(),
+        None => every_eighth(names.len()).into_iter().collect(),
+    };
+    (0..names.len()).partition(|view| !chosen.contains(view))
+}
+
+pub(crate) fn check_split(train: &[usize], held_out: &[usize], faults: &mut Faults) {
+    let count = train.len();
+    if count == 0 && !held_out.is_empty() {
+        faults.error(
+            format!("all {} views are held out", held_out.len()),
+            HELD_OUT_FILE,
+            "leave most views for training: every eighth is a good share",
+        );
+    } else if count < FEWEST_TRAINING_VIEWS {
+        faults.error(
+            format!(
+                "{count} training views are too few, at least {FEWEST_TRAINING_VIEWS} are needed"
+            ),
+            "images/",
+            "take more photographs around the object, or hold out fewer",
+        );
+    }
 }
 
 #[cfg(test)]

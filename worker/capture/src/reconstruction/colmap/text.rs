@@ -6,9 +6,10 @@ use std::str::{FromStr, SplitAsciiWhitespace};
 
 use glam::DVec3;
 
-use super::{Model, ModelImage, ModelPoint, Source, UNSUPPORTED_HINT, add_camera, pose};
+use super::{Source, UNSUPPORTED_HINT, pose};
 use crate::distortion::{ModelKind, SourceCamera};
 use crate::fault::Faults;
+use crate::reconstruction::{Model, ModelImage, ModelPoint, add_camera};
 
 const LINE_HINT: &str = "re-export the model as text, or delete the line";
 

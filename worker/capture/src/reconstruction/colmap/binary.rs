@@ -8,9 +8,10 @@ use std::io::{self, BufRead, BufReader, Read};
 
 use glam::DVec3;
 
-use super::{Model, ModelImage, ModelPoint, Source, UNSUPPORTED_HINT, add_camera, pose};
+use super::{Source, UNSUPPORTED_HINT, pose};
 use crate::distortion::{ModelKind, SourceCamera};
 use crate::fault::Faults;
+use crate::reconstruction::{Model, ModelImage, ModelPoint, add_camera};
 
 /// Longest name of a photograph that is believed.
 const NAME_BYTES: usize = 4096;

@@ -8,44 +8,12 @@
 mod binary;
 mod text;
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DQuat, DVec3};
 
-use crate::distortion::SourceCamera;
 use crate::fault::Faults;
-
-/// A sparse model as read. Entries with faults are left out and were reported.
-#[derive(Debug, Default)]
-pub(crate) struct Model {
-    /// By camera id; `None` where the camera was there but has a fault.
-    pub(crate) cameras: BTreeMap<u32, Option<SourceCamera>>,
-    pub(crate) images: Vec<ModelImage>,
-    /// The list of images was read to its end, without a fault in it.
-    pub(crate) has_all_images: bool,
-    pub(crate) points: Vec<ModelPoint>,
-}
-
-#[derive(Debug)]
-pub(crate) struct ModelImage {
-    pub(crate) id: u32,
-    pub(crate) name: String,
-    pub(crate) camera_id: u32,
-    pub(crate) camera_from_world: DAffine3,
-    /// Where it stands, for faults found later.
-    pub(crate) at: String,
-}
-
-#[derive(Debug)]
-pub(crate) struct ModelPoint {
-    pub(crate) position: DVec3,
-    pub(crate) color: [u8; 3],
-    /// Mean reprojection error in pixels.
-    pub(crate) error_px: f64,
-    /// Ids of the images that saw it.
-    pub(crate) image_ids: Vec<u32>,
-}
+use crate::reconstruction::Model;
 
 /// The folder of the model inside the capture: `sparse/0` or `sparse`.
 pub(crate) fn locate(dir: &Path, faults: &mut Faults) -> Option<PathBuf> {
@@ -151,37 +119,6 @@ fn pose(values: &[f64; 7]) -> Result<DAffine3, &'static str> {
         rotation.normalize(),
         DVec3::new(tx, ty, tz),
     ))
-}
-
-/// Enters a camera, or its fault.
-fn add_camera(
-    model: &mut Model,
-    faults: &mut Faults,
-    id: u32,
-    at: &str,
-    camera: Result<SourceCamera, (String, &'static str)>,
-) {
-    let checked = camera.and_then(|camera| match camera.fault() {
-        Some(message) => Err((
-            message,
-            "re-export the model with sound intrinsics, for example as PINHOLE",
-        )),
-        None => Ok(camera),
-    });
-    let entry = match checked {
-        Ok(camera) => Some(camera),
-        Err((message, hint)) => {
-            faults.error(format!("camera {id} {message}"), at, hint);
-            None
-        }
-    };
-    if model.cameras.insert(id, entry).is_some() {
-        faults.error(
-            format!("camera {id} is there twice"),
-            at,
-            "re-export the model",
-        );
-    }
 }
 
 /// Names of the models that can be imported, for hints.

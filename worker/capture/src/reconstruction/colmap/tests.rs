@@ -7,6 +7,7 @@ use glam::{DVec2, DVec3};
 
 use super::*;
 use crate::fault::{Fault, Severity};
+use crate::reconstruction::ModelImage;
 
 fn reference() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/colmap")
