@@ -8,8 +8,9 @@
 //! (it is two thirds of a step's cost, and lowers no error that is scored). The preset `paper` has the paper's.
 
 use ign_nets::composition::{BlendComposition, BlendInput, PaperComposition};
+use ign_nets::losses;
 use ign_nets::optim::{Adam, cosine_rate};
-use ign_nets::patchgan::{PatchGan, adversarial_loss};
+use ign_nets::patchgan::PatchGan;
 use ign_nets::{Builder, Params, color};
 use ign_render::{Composition, Model};
 use rand::RngExt;
@@ -22,8 +23,6 @@ use crate::sampler::step_rng;
 
 /// Peak learning rate of the blending head.
 const BLEND_RATE: f64 = 1.5e-3;
-/// Weight of the squared term against the l1 term.
-const SQUARED: f64 = 4.0;
 const AVERAGE_DECAY: f64 = 0.995;
 /// Paper: the adversarial loss counts 0.01, the l1 loss 1.
 const ADVERSARIAL: f64 = 0.01;
@@ -246,11 +245,7 @@ pub(crate) fn train_blend(
             let truth = Tensor::cat(&truths, 0).to_kind(Kind::Float);
             let coverage = Tensor::cat(&coverages, 0).to_kind(Kind::Float);
             let image = net.forward(&trainee.params, &BlendInput::batch(&inputs)) * &coverage;
-            let difference = image - truth;
-            let weight = coverage.sum(Kind::Float).clamp_min(1.0) * 3.0;
-            let loss = ((difference.square() + 1e-6).sqrt().sum(Kind::Float)
-                + difference.square().sum(Kind::Float) * SQUARED)
-                / weight;
+            let loss = losses::blend(&image, &truth, &coverage);
             let value = loss.double_value(&[]);
             loss.backward();
             trainee.adam.step(
@@ -344,20 +339,20 @@ pub(crate) fn train_paper(
                 return f64::NAN;
             };
             let image = net.forward(&generator.params, &input, true) * &coverage;
-            let mut loss = (&image - &truth).abs().mean(Kind::Float);
+            let mut loss = losses::l1(&image, &truth);
             let size = truth.size();
             let adversarial = size[2].min(size[3]) >= LEAST_GAN_PX;
             if adversarial {
                 let fake = critic.forward(&discriminator.params, &input, &image.detach(), true);
                 let real = critic.forward(&discriminator.params, &input, &truth, true);
                 let criticism =
-                    (adversarial_loss(&fake, false) + adversarial_loss(&real, true)) * 0.5;
+                    (losses::adversarial(&fake, false) + losses::adversarial(&real, true)) * 0.5;
                 criticism.backward();
                 discriminator
                     .adam
                     .step(&mut discriminator.params, 1e-3 * scale, f64::INFINITY);
                 let verdict = critic.forward(&discriminator.params, &input, &image, true);
-                loss += adversarial_loss(&verdict, true) * ADVERSARIAL;
+                loss += losses::adversarial(&verdict, true) * ADVERSARIAL;
             }
             let value = loss.double_value(&[]);
             loss.backward();

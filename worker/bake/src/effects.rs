@@ -6,9 +6,10 @@
 //! is unknown and the pair does not count.
 
 use ign_nets::effects::{PaperEffects, PointEffects};
+use ign_nets::losses::{self, Pair};
 use ign_nets::optim::{Adam, cosine_rate};
 use ign_nets::warp::{Sources, directions};
-use ign_nets::{Builder, Params, color};
+use ign_nets::{Builder, Params};
 use ign_render::{Effects, Target};
 use rand::RngExt;
 use rayon::prelude::*;
@@ -27,8 +28,6 @@ const AVERAGE_DECAY: f64 = 0.995;
 const POINT_RATE: f64 = 2e-3;
 /// Surface observations kept at most; more views thin them out evenly.
 const MOST_OBSERVATIONS: usize = 4_000_000;
-/// Encoded value above which a colour is clipped.
-const CLIPPED: f64 = 0.98;
 
 /// Name of the stage in checkpoints.
 pub(crate) const STAGE: &str = "effects";
@@ -313,19 +312,15 @@ fn point_loss(
         &normals,
         &directions(&centers.index_select(0, &there_view), &points),
     );
-    let (linear_here, linear_there) = (
-        color::linear_from_srgb(&color_here),
-        color::linear_from_srgb(&color_there),
-    );
-    let predicted_here = color::srgb_from_linear(&(&linear_there - &there + &here));
-    let predicted_there = color::srgb_from_linear(&(&linear_here - &here + &there));
-    let unclipped = |c: &Tensor| c.lt(CLIPPED).to_kind(Kind::Float);
-    let robust = |d: Tensor| (d.square() + 1e-4).sqrt();
-    let error = robust(predicted_here - &color_here) * unclipped(&color_there)
-        + robust(predicted_there - &color_there) * unclipped(&color_here);
-    let data_term =
-        (error * &sound).sum(Kind::Float) / (sound.sum(Kind::Float) * 6.0).clamp_min(1.0);
-    Some(data_term + (here + there).mean(Kind::Float) * (0.5 * SPARSITY))
+    let data_term = losses::pair(&Pair {
+        color_here: &color_here,
+        color_there: &color_there,
+        effects_here: &here,
+        effects_there: &there,
+        sound: &sound,
+    });
+    let size = losses::sparsity(&here) + losses::sparsity(&there);
+    Some(data_term + size * (0.5 * SPARSITY))
 }
 
 /// Everything the paper's `EffectsNet` needs of one training view.
@@ -413,10 +408,8 @@ pub(crate) fn train_paper(
             let taps = sources.taps(&points, &normals, &zeros).weighted(&q.mask);
             let visible = taps.visibility.gt(0.5).to_kind(Kind::Float).unsqueeze(1);
             let warped = taps.gather(&diffuse_q) / taps.visibility.clamp_min(1e-3).unsqueeze(1);
-            let difference = (rows(diffuse_p) - warped) * &visible;
-            let count = (visible.sum(Kind::Float) * 3.0).clamp_min(1.0);
-            let loss = (difference.square().sum(Kind::Float) / count + 1e-8).sqrt()
-                + effects.abs().mean(Kind::Float) * SPARSITY;
+            let loss = losses::diffuse_distance(&rows(diffuse_p), &warped, &visible)
+                + losses::sparsity(&effects) * SPARSITY;
             let value = loss.double_value(&[]);
             loss.backward();
             trainee

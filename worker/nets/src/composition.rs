@@ -12,6 +12,8 @@ use crate::params::{Builder, Init, Params};
 use crate::unet::{Conv, UNet};
 use tch::{Kind, Tensor};
 
+/// Reductions keep the kind of their input, so that gradients can be checked in f64.
+const KEEP: Option<Kind> = None;
 const PAPER_WIDTHS: [i64; 6] = [64, 64, 128, 128, 256, 256];
 
 /// The paper's `CompositionNet`: input 3K warped colours, 2K warp fields, 3 target positions.
@@ -86,11 +88,7 @@ impl BlendInput {
 
     /// [B, 3, H, W]: plain image-based rendering with the prior's weights.
     pub fn prior_blend(&self) -> Tensor {
-        (&self.candidates * self.prior.unsqueeze(2)).sum_dim_intlist(
-            [1i64].as_slice(),
-            false,
-            Kind::Float,
-        )
+        (&self.candidates * self.prior.unsqueeze(2)).sum_dim_intlist([1i64].as_slice(), false, KEEP)
     }
 }
 
@@ -159,7 +157,11 @@ impl BlendComposition {
         let (batch, height, width) = (size[0], size[3], size[4]);
         // Candidates are shown as differences from the plain blend: that is what the weights act on.
         let differences = (&input.candidates - base.unsqueeze(1))
-            * input.visibility.gt(0.0).to_kind(Kind::Float).unsqueeze(2);
+            * input
+                .visibility
+                .gt(0.0)
+                .to_kind(input.candidates.kind())
+                .unsqueeze(2);
         let x = Tensor::cat(
             &[
                 differences.reshape([batch, self.k * 3, height, width]) * 4.0,
@@ -193,13 +195,13 @@ impl BlendComposition {
             .forward(params, &x)
             .narrow(2, 0, height)
             .narrow(3, 0, width);
-        let seen = input.visibility.gt(0.0).to_kind(Kind::Float);
+        let seen = input.visibility.gt(0.0).to_kind(input.candidates.kind());
         let logits = (&input.prior + 1e-4).log() + out.narrow(1, 0, self.k) + (seen - 1.0) * 1e4;
         let generated_logit = out.narrow(1, self.k, 1) + GENERATED_LOGIT;
-        let weights = Tensor::cat(&[logits, generated_logit], 1).softmax(1, Kind::Float);
+        let weights = Tensor::cat(&[logits, generated_logit], 1).softmax(1, KEEP);
         let generated = &base + out.narrow(1, self.k + 1, 3);
         let blended = (&input.candidates * weights.narrow(1, 0, self.k).unsqueeze(2))
-            .sum_dim_intlist([1i64].as_slice(), false, Kind::Float);
+            .sum_dim_intlist([1i64].as_slice(), false, KEEP);
         blended + generated * weights.narrow(1, self.k, 1)
     }
 }

@@ -92,7 +92,7 @@ impl PointEffects {
         to_viewer: &Tensor,
     ) -> Tensor {
         let reflection = crate::warp::reflections(to_viewer, normals);
-        let cosine = (to_viewer * normals).sum_dim_intlist([1i64].as_slice(), true, Kind::Float);
+        let cosine = (to_viewer * normals).sum_dim_intlist([1i64].as_slice(), true, None::<Kind>);
         let mut x = Tensor::cat(
             &[
                 frequency_code(points, POSITION_OCTAVES),

@@ -9,6 +9,7 @@ pub mod color;
 pub mod composition;
 pub mod device;
 pub mod effects;
+pub mod losses;
 pub mod optim;
 pub mod params;
 pub mod patchgan;

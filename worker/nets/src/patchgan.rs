@@ -4,7 +4,7 @@
 
 use crate::params::{Builder, Params};
 use crate::unet::{BatchNorm, Conv};
-use tch::{Kind, Tensor};
+use tch::Tensor;
 
 /// `PatchGAN` discriminator.
 #[derive(Debug)]
@@ -56,14 +56,4 @@ impl PatchGan {
         }
         self.head.forward(params, &x)
     }
-}
-
-/// Binary cross-entropy of patch logits against "all real" or "all generated".
-pub fn adversarial_loss(logits: &Tensor, real: bool) -> Tensor {
-    let signed = if real {
-        -logits
-    } else {
-        logits.shallow_clone()
-    };
-    signed.softplus().mean(Kind::Float)
 }

@@ -6,7 +6,7 @@
 //! for `EffectsNet` and 5.2 M for `CompositionNet`.
 
 use crate::params::{Builder, Init, ParamId, Params};
-use tch::{Kind, Tensor};
+use tch::Tensor;
 
 /// Batch normalisation with running statistics.
 #[derive(Debug)]
@@ -218,14 +218,4 @@ impl UNet {
         let x = self.head.forward(params, &x.constant_pad_nd([1, 2, 1, 2]));
         x.narrow(2, 0, height).narrow(3, 0, width)
     }
-}
-
-/// Mean of absolute values weighted by `weight` (broadcast); 0 when nothing has weight.
-pub fn weighted_l1(difference: &Tensor, weight: &Tensor) -> Tensor {
-    let weighted = (difference.abs() * weight).sum(Kind::Float);
-    let total = weight
-        .expand_as(difference)
-        .sum(Kind::Float)
-        .clamp_min(1e-6);
-    weighted / total
 }

@@ -14,6 +14,9 @@ use glam::{DAffine3, DVec3};
 use ign_geometry::Camera;
 use tch::{Device, Kind, Tensor};
 
+/// Reductions keep the kind of their input, so that gradients can be checked in f64.
+const KEEP: Option<Kind> = None;
+
 /// Cosine below which a source sees a point too obliquely to be used at all.
 pub const GRAZING_COSINE: f64 = 0.05;
 /// Cosine above which a source's obliqueness costs no confidence.
@@ -224,18 +227,19 @@ impl Taps {
         let picked = image
             .index_select(0, &self.index.view([-1]))
             .view([points, 4, channels]);
-        (picked * self.weight.unsqueeze(2)).sum_dim_intlist([1i64].as_slice(), false, Kind::Float)
+        let weight = self.weight.to_kind(image.kind()).unsqueeze(2);
+        (picked * weight).sum_dim_intlist([1i64].as_slice(), false, KEEP)
     }
 
     /// These taps with each weight multiplied by the source's own weight: alpha [V*H*W].
     #[must_use]
     pub fn weighted(&self, alpha: &Tensor) -> Self {
         let points = self.index.size()[0];
-        let weight = &self.weight
+        let weight = self.weight.to_kind(alpha.kind())
             * alpha
                 .index_select(0, &self.index.view([-1]))
                 .view([points, 4]);
-        let visibility = weight.sum_dim_intlist([1i64].as_slice(), false, Kind::Float);
+        let visibility = weight.sum_dim_intlist([1i64].as_slice(), false, KEEP);
         Self {
             index: self.index.shallow_clone(),
             weight,
@@ -265,7 +269,7 @@ pub fn directions(centers: &Tensor, points: &Tensor) -> Tensor {
     let d = centers - points;
     let norm = d
         .square()
-        .sum_dim_intlist([1i64].as_slice(), true, Kind::Float)
+        .sum_dim_intlist([1i64].as_slice(), true, KEEP)
         .sqrt()
         .clamp_min(1e-9);
     d / norm
@@ -273,6 +277,6 @@ pub fn directions(centers: &Tensor, points: &Tensor) -> Tensor {
 
 /// Mirrors unit directions towards the viewer [P, 3] about unit normals [P, 3].
 pub fn reflections(to_viewer: &Tensor, normals: &Tensor) -> Tensor {
-    let cosine = (to_viewer * normals).sum_dim_intlist([1i64].as_slice(), true, Kind::Float);
+    let cosine = (to_viewer * normals).sum_dim_intlist([1i64].as_slice(), true, KEEP);
     cosine * 2.0 * normals - to_viewer
 }
