@@ -22,8 +22,6 @@ use crate::progress::Reporter;
 use crate::recipe::Settings;
 use crate::run::BakeJob;
 
-/// Frames of the turntable preview.
-const PREVIEW_FRAMES: usize = 36;
 /// Milliseconds that a frame stays: one round in about three seconds.
 const PREVIEW_FRAME_MS: i32 = 90;
 /// WebP's quality, 0 to 100.
@@ -117,7 +115,7 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
         .map(|(name, scored)| (name.clone(), scored.target.camera))
         .collect();
     writer.held_out_cameras(&held_out_cameras)?;
-    let frames = turntable(data, model, reporter);
+    let frames = turntable(data, model, settings.preview_frames, reporter);
     writer.file("preview.webp", &animation(&frames)?)?;
     if let Some(first) = frames.first() {
         writer.file("thumbnail.jpg", &jpeg(first)?)?;
@@ -244,13 +242,18 @@ fn report_views(views: &[(String, &Scored)], rows: &[Row], model: &Model) -> Vec
 }
 
 /// One round around the object.
-fn turntable(data: &Dataset<'_>, model: &Model, reporter: &Reporter<'_>) -> Vec<RgbImage> {
-    let cameras = orbit(&model.references.cameras, PREVIEW_FRAMES, PREVIEW_PX);
+fn turntable(
+    data: &Dataset<'_>,
+    model: &Model,
+    frames: usize,
+    reporter: &Reporter<'_>,
+) -> Vec<RgbImage> {
+    let cameras = orbit(&model.references.cameras, frames, PREVIEW_PX);
     cameras
         .iter()
         .enumerate()
         .map(|(at, camera)| {
-            reporter.step(at as f64 / PREVIEW_FRAMES as f64, "rendering the turntable");
+            reporter.step(at as f64 / frames as f64, "rendering the turntable");
             let target = Target::new(&data.mesh, camera, &data.settings, data.device);
             to_image(&model.image(&target))
         })

@@ -90,6 +90,8 @@ pub(crate) struct Settings {
     pub(crate) half_weights: bool,
     pub(crate) checkpoint_secs: f64,
     pub(crate) margin: f64,
+    /// Frames of the turntable preview.
+    pub(crate) preview_frames: usize,
 }
 
 impl Recipe {
@@ -135,6 +137,7 @@ impl Recipe {
             half_weights: false,
             checkpoint_secs: 20.0,
             margin: 0.05,
+            preview_frames: 36,
         };
         for (key, value) in &self.settings {
             settings.set(key, value)?;
@@ -172,11 +175,12 @@ impl Settings {
             "half_weights" => self.half_weights = switch(key, value)?,
             "checkpoint_secs" => self.checkpoint_secs = number(key, value, 0.0, 86_400.0)?,
             "margin" => self.margin = number(key, value, 0.0, 2.0)?,
+            "preview_frames" => self.preview_frames = number(key, value, 1, 360)?,
             _ => {
                 return Err(invalid(
                     format!("setting {key} is unknown"),
                     "known: k, references, supersample, effects, effects_steps, effects_batch, composition_steps, \
-                     batch, patch, ablate_effects, compare_paper, half_weights, checkpoint_secs, margin",
+                     batch, patch, ablate_effects, compare_paper, half_weights, checkpoint_secs, margin, preview_frames",
                 ));
             }
         }

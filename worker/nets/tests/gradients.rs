@@ -276,12 +276,8 @@ fn of_the_networks() {
     let params = builder.build(Device::Cpu, 4);
     // The head starts at zero, behind which nothing would have a gradient.
     no_grad(|| {
-        drop(
-            params
-                .flat()
-                .shallow_clone()
-                .g_add_(&(params.flat().randn_like() * 0.03)),
-        )
+        let noise = params.flat().randn_like() * 0.03;
+        drop(params.flat().shallow_clone().g_add_(&noise));
     });
     let visibility = Tensor::rand([1, 3, 8, 16], F64)
         .gt(0.3)
