@@ -130,7 +130,8 @@ impl Snapshot {
 }
 
 impl<'a> Session<'a> {
-    /// Starts afresh, or from `checkpoint`, which must be of the same recipe and capture.
+    /// Starts from `checkpoint` where it can be read and is of the same recipe and capture, else afresh: training again
+    /// costs time, but an error would come back at every further attempt.
     pub(crate) fn open(
         reporter: &'a Reporter<'a>,
         dir: &Path,
@@ -162,8 +163,10 @@ impl<'a> Session<'a> {
             weights: BTreeMap::new(),
             resumed: None,
         };
-        if let Some(path) = checkpoint {
-            session.load(path)?;
+        if let Some(path) = checkpoint
+            && let Err(error) = session.load(path)
+        {
+            reporter.warn(format!("{error}; training starts from the beginning"));
         }
         Ok(session)
     }
@@ -418,17 +421,19 @@ impl<'a> Session<'a> {
             let shape = view.shape().iter().map(|&n| n as i64).collect();
             Ok((shape, floats(view.data())))
         };
+        let mut weights: BTreeMap<String, Weights> = BTreeMap::new();
         for name in file.names() {
             if let Some((stage, tensor)) = name
                 .strip_prefix("finished/")
                 .and_then(|rest| rest.split_once('/'))
             {
-                self.weights
+                weights
                     .entry(stage.into())
                     .or_default()
                     .insert(tensor.into(), values(name)?);
             }
         }
+        let mut resumed = None;
         if let Some(current) = &meta.current {
             let mut snapshot = Snapshot {
                 flat: Vec::new(),
@@ -450,9 +455,9 @@ impl<'a> Session<'a> {
                     steps,
                 });
             }
-            self.resumed = Some(snapshot);
+            resumed = Some(snapshot);
         }
-        self.meta = meta;
+        (self.meta, self.weights, self.resumed) = (meta, weights, resumed);
         Ok(())
     }
 }

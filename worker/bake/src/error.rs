@@ -31,7 +31,7 @@ pub enum BakeError {
     /// A weights tensor does not fit its network.
     #[error("the network's weights do not fit")]
     Net(#[from] NetError),
-    /// The checkpoint cannot be read.
+    /// A checkpoint cannot be written or read.
     #[error("checkpoint {path} cannot be used: {reason}")]
     Checkpoint {
         /// Where it lies.

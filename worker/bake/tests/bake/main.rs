@@ -149,25 +149,37 @@ fn resuming_gives_what_an_unbroken_bake_gives() {
 }
 
 #[test]
-fn a_checkpoint_of_another_recipe_is_refused() {
+fn a_checkpoint_that_cannot_be_used_starts_from_the_beginning() {
     let dir = tempfile::tempdir().expect("a folder");
     let capture = capture(dir.path(), 0.0);
     let last = RefCell::new(None);
-    let first = recipe(&[("effects", "off")]);
-    bake(&job(&capture, &dir.path().join("one"), first), &|event| {
+    let short = [("effects", "off"), ("ablate_effects", "off")];
+    let other = recipe(&[short[0], short[1], ("k", "3")]);
+    bake(&job(&capture, &dir.path().join("one"), other), &|event| {
         if let Event::Checkpoint { path } = event {
             *last.borrow_mut() = Some(path);
         }
     })
     .expect("a bake");
-    let mut other = job(
-        &capture,
-        &dir.path().join("two"),
-        recipe(&[("effects", "off"), ("k", "3")]),
-    );
-    other.checkpoint = last.into_inner();
-    let error = bake(&other, &|_| {}).expect_err("another recipe");
-    assert!(error.to_string().contains("another recipe"), "{error}");
+    let of_another_recipe = last.into_inner().expect("a checkpoint");
+    let whole = std::fs::read(&of_another_recipe).expect("a file");
+    let cut = dir.path().join("cut.safetensors");
+    std::fs::write(&cut, &whole[..whole.len() / 2]).expect("written");
+
+    let afresh = job(&capture, &dir.path().join("afresh"), recipe(&short));
+    let expected = weights(&bake(&afresh, &|_| {}).expect("a bake"));
+    for (name, checkpoint) in [("other", of_another_recipe), ("cut", cut)] {
+        let mut job = job(&capture, &dir.path().join(name), recipe(&short));
+        job.checkpoint = Some(checkpoint);
+        let warned = RefCell::new(false);
+        let bundle = bake(&job, &|event| {
+            if let Event::Log { message, .. } = event {
+                *warned.borrow_mut() |= message.contains("starts from the beginning");
+            }
+        });
+        assert!(weights(&bundle.expect("a bake")) == expected, "{name}");
+        assert!(warned.into_inner(), "{name}");
+    }
 }
 
 #[test]
