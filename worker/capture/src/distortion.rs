@@ -1,19 +1,20 @@
-//! COLMAP's camera models: from a ray of the undistorted pinhole to a pixel of the photograph.
+//! Camera models: from a ray in camera axes to a pixel of the photograph.
 //!
-//! All supported models are one formula. With `(u, v)` the ray at z = 1 and `r = |(u, v)|`:
+//! Most models are one formula. With `(u, v)` the ray at z = 1 and `r = |(u, v)|`:
 //!
 //! ```text
-//! s      = r, or atan(r) for the fisheye models
-//! g(s)   = (1 + a1 s^2 + a2 s^4 + a3 s^6 + a4 s^8) / (1 + b1 s^2 + b2 s^4 + b3 s^6)
-//! (u',v') = (u, v) * s g(s) / r  +  tangential(u, v)
-//! x = fx u' + cx,  y = fy v' + cy
+//! s      = r, or the angle to the axis for the fisheye models;  (a, b) = (u, v) s / r
+//! g(s)   = (1 + a1 s^2 + ... + a6 s^12) / (1 + b1 s^2 + b2 s^4 + b3 s^6)
+//! (u',v') = (a, b) g(s)  +  tangential(a, b)  +  thin prism(a, b)
+//! x = fx u' + skew v' + cx,  y = fy v' + cy
 //! ```
 //!
-//! Source: COLMAP `src/colmap/sensor/models.h` and its documentation page "Camera Models".
+//! The others (field of view, division, enhanced unified, panorama) are variants of [`Lens`]. Source: COLMAP
+//! `src/colmap/sensor/models.h` and its documentation page "Camera Models".
 //! The polynomial folds back beyond some radius, where rays far outside the photograph would land inside it again;
 //! [`SourceCamera::project`] answers `None` from there on.
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 /// Camera models of COLMAP that can be imported.
@@ -42,6 +43,20 @@ pub enum CameraModel {
     SimpleFisheye,
     /// fx, fy, cx, cy
     Fisheye,
+    /// fx, fy, cx, cy, omega
+    Fov,
+    /// fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1
+    ThinPrismFisheye,
+    /// fx, fy, cx, cy, k0 .. k5, p0, p1, s0 .. s3
+    RadTanThinPrismFisheye,
+    /// f, cx, cy, k
+    SimpleDivision,
+    /// fx, fy, cx, cy, k
+    Division,
+    /// fx, fy, cx, cy, alpha, beta
+    Eucm,
+    /// width, height
+    Equirectangular,
 }
 
 /// One row of COLMAP's model table: number in binary files, name in text files, number of parameters.
@@ -49,10 +64,10 @@ struct ModelRow {
     id: i32,
     name: &'static str,
     params: usize,
-    model: Option<CameraModel>,
+    model: CameraModel,
 }
 
-const fn row(id: i32, name: &'static str, params: usize, model: Option<CameraModel>) -> ModelRow {
+const fn row(id: i32, name: &'static str, params: usize, model: CameraModel) -> ModelRow {
     ModelRow {
         id,
         name,
@@ -61,31 +76,35 @@ const fn row(id: i32, name: &'static str, params: usize, model: Option<CameraMod
     }
 }
 
-/// Models without a [`CameraModel`] are known by name and length only, so that a file that holds one can be read on.
 const MODELS: [ModelRow; 18] = [
-    row(0, "SIMPLE_PINHOLE", 3, Some(CameraModel::SimplePinhole)),
-    row(1, "PINHOLE", 4, Some(CameraModel::Pinhole)),
-    row(2, "SIMPLE_RADIAL", 4, Some(CameraModel::SimpleRadial)),
-    row(3, "RADIAL", 5, Some(CameraModel::Radial)),
-    row(4, "OPENCV", 8, Some(CameraModel::Opencv)),
-    row(5, "OPENCV_FISHEYE", 8, Some(CameraModel::OpencvFisheye)),
-    row(6, "FULL_OPENCV", 12, Some(CameraModel::FullOpencv)),
-    row(7, "FOV", 5, None),
+    row(0, "SIMPLE_PINHOLE", 3, CameraModel::SimplePinhole),
+    row(1, "PINHOLE", 4, CameraModel::Pinhole),
+    row(2, "SIMPLE_RADIAL", 4, CameraModel::SimpleRadial),
+    row(3, "RADIAL", 5, CameraModel::Radial),
+    row(4, "OPENCV", 8, CameraModel::Opencv),
+    row(5, "OPENCV_FISHEYE", 8, CameraModel::OpencvFisheye),
+    row(6, "FULL_OPENCV", 12, CameraModel::FullOpencv),
+    row(7, "FOV", 5, CameraModel::Fov),
     row(
         8,
         "SIMPLE_RADIAL_FISHEYE",
         4,
-        Some(CameraModel::SimpleRadialFisheye),
+        CameraModel::SimpleRadialFisheye,
     ),
-    row(9, "RADIAL_FISHEYE", 5, Some(CameraModel::RadialFisheye)),
-    row(10, "THIN_PRISM_FISHEYE", 12, None),
-    row(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16, None),
-    row(12, "SIMPLE_DIVISION", 4, None),
-    row(13, "DIVISION", 5, None),
-    row(14, "SIMPLE_FISHEYE", 3, Some(CameraModel::SimpleFisheye)),
-    row(15, "FISHEYE", 4, Some(CameraModel::Fisheye)),
-    row(16, "EUCM", 6, None),
-    row(17, "EQUIRECTANGULAR", 2, None),
+    row(9, "RADIAL_FISHEYE", 5, CameraModel::RadialFisheye),
+    row(10, "THIN_PRISM_FISHEYE", 12, CameraModel::ThinPrismFisheye),
+    row(
+        11,
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        16,
+        CameraModel::RadTanThinPrismFisheye,
+    ),
+    row(12, "SIMPLE_DIVISION", 4, CameraModel::SimpleDivision),
+    row(13, "DIVISION", 5, CameraModel::Division),
+    row(14, "SIMPLE_FISHEYE", 3, CameraModel::SimpleFisheye),
+    row(15, "FISHEYE", 4, CameraModel::Fisheye),
+    row(16, "EUCM", 6, CameraModel::Eucm),
+    row(17, "EQUIRECTANGULAR", 2, CameraModel::Equirectangular),
 ];
 
 /// What a model's number or name stands for.
@@ -93,7 +112,7 @@ const MODELS: [ModelRow; 18] = [
 pub(crate) struct ModelKind {
     pub(crate) name: &'static str,
     pub(crate) params: usize,
-    pub(crate) model: Option<CameraModel>,
+    pub(crate) model: CameraModel,
 }
 
 impl ModelKind {
@@ -114,7 +133,41 @@ impl ModelKind {
     }
 }
 
-/// A photograph's own camera: pinhole intrinsics and lens distortion, in pixels of the photograph.
+/// How a lens bends rays, before focal lengths and principal point.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Lens {
+    /// The module's formula.
+    Polynomial(Polynomial),
+    /// Devernay and Faugeras 2001: the distorted radius is `atan(2 r tan(omega / 2)) / omega`.
+    Fov { omega: f64 },
+    /// Fitzgibbon 2001: a pixel at radius d looks along radius `d / (1 + k d^2)`.
+    Division { k: f64 },
+    /// Enhanced unified camera model, Khomutenko et al. 2016.
+    Eucm { alpha: f64, beta: f64 },
+    /// Longitude and latitude over the whole sphere.
+    Equirectangular,
+}
+
+/// Coefficients of the module's formula.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Polynomial {
+    fisheye: bool,
+    /// a1..a6.
+    radial: [f64; 6],
+    /// b1..b3.
+    denominator: [f64; 3],
+    /// p1, p2.
+    tangential: [f64; 2],
+    /// Thin prism: x by q^2 and q^4, y by q^2 and q^4.
+    prism: [f64; 4],
+    /// Tangential and prism terms act on what the radial factor has moved.
+    radial_first: bool,
+    /// Largest s up to which the radial part grows.
+    s_limit: f64,
+}
+
+/// A photograph's own camera: intrinsics and lens, in pixels of the photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SourceCamera {
     /// The model it was given as.
@@ -131,14 +184,10 @@ pub struct SourceCamera {
     pub cx: f64,
     /// Principal point y, pixels.
     pub cy: f64,
-    /// a1..a4 of the module's formula.
-    pub radial: [f64; 4],
-    /// b1..b3 of the module's formula.
-    pub denominator: [f64; 3],
-    /// p1, p2.
-    pub tangential: [f64; 2],
-    /// Largest s of the module's formula up to which the radial part grows.
-    s_limit: f64,
+    /// How far x moves, in pixels, per unit of the bent ray's y.
+    pub skew: f64,
+    /// The lens.
+    pub(crate) lens: Lens,
 }
 
 /// Largest ray radius (tangent of the angle to the axis) that the scan for folding looks at.
@@ -156,76 +205,91 @@ impl SourceCamera {
         height: u32,
         params: &[f64],
     ) -> Option<Self> {
-        let mut camera = Self {
+        use CameraModel as M;
+        let one_focal_length = matches!(
+            model,
+            M::SimplePinhole
+                | M::SimpleRadial
+                | M::Radial
+                | M::SimpleRadialFisheye
+                | M::RadialFisheye
+                | M::SimpleFisheye
+                | M::SimpleDivision
+        );
+        let (fx, fy, cx, cy, rest) = match *params {
+            // A panorama's two numbers repeat its size: its pixels are angles.
+            [w, h] if model == M::Equirectangular => {
+                let (x, y) = (w / std::f64::consts::TAU, h / std::f64::consts::PI);
+                (x, y, w / 2.0, h / 2.0, &params[2..])
+            }
+            [f, cx, cy, ref rest @ ..] if one_focal_length => (f, f, cx, cy, rest),
+            [fx, fy, cx, cy, ref rest @ ..] if !one_focal_length => (fx, fy, cx, cy, rest),
+            _ => return None,
+        };
+        let mut bend = Polynomial::NONE;
+        bend.fisheye = matches!(
+            model,
+            M::OpencvFisheye
+                | M::SimpleRadialFisheye
+                | M::RadialFisheye
+                | M::SimpleFisheye
+                | M::Fisheye
+                | M::ThinPrismFisheye
+                | M::RadTanThinPrismFisheye
+        );
+        let mut lens = None;
+        match (model, rest) {
+            (M::SimplePinhole | M::Pinhole | M::SimpleFisheye | M::Fisheye, &[]) => {}
+            (M::SimpleRadial | M::SimpleRadialFisheye, &[k]) => bend.radial[0] = k,
+            (M::Radial | M::RadialFisheye, &[k1, k2]) => {
+                bend.radial[..2].copy_from_slice(&[k1, k2]);
+            }
+            (M::Opencv, &[k1, k2, p1, p2]) => {
+                bend.radial[..2].copy_from_slice(&[k1, k2]);
+                bend.tangential = [p1, p2];
+            }
+            (M::OpencvFisheye, &[k1, k2, k3, k4]) => {
+                bend.radial[..4].copy_from_slice(&[k1, k2, k3, k4]);
+            }
+            (M::FullOpencv, &[k1, k2, p1, p2, k3, k4, k5, k6]) => {
+                bend.radial[..3].copy_from_slice(&[k1, k2, k3]);
+                bend.denominator = [k4, k5, k6];
+                bend.tangential = [p1, p2];
+            }
+            (M::ThinPrismFisheye, &[k1, k2, p1, p2, k3, k4, sx, sy]) => {
+                bend.radial[..4].copy_from_slice(&[k1, k2, k3, k4]);
+                bend.tangential = [p1, p2];
+                bend.prism = [sx, 0.0, sy, 0.0];
+            }
+            (M::RadTanThinPrismFisheye, &[a1, a2, a3, a4, a5, a6, p0, p1, s0, s1, s2, s3]) => {
+                bend.radial = [a1, a2, a3, a4, a5, a6];
+                // This model counts its tangential pair the other way round.
+                bend.tangential = [p1, p0];
+                bend.prism = [s0, s1, s2, s3];
+                bend.radial_first = true;
+            }
+            (M::Fov, &[omega]) => lens = Some(Lens::Fov { omega }),
+            (M::SimpleDivision | M::Division, &[k]) => lens = Some(Lens::Division { k }),
+            (M::Eucm, &[alpha, beta]) => lens = Some(Lens::Eucm { alpha, beta }),
+            (M::Equirectangular, &[]) => lens = Some(Lens::Equirectangular),
+            _ => return None,
+        }
+        Some(Self {
             model,
             width,
             height,
-            fx: 0.0,
-            fy: 0.0,
-            cx: 0.0,
-            cy: 0.0,
-            radial: [0.0; 4],
-            denominator: [0.0; 3],
-            tangential: [0.0; 2],
-            s_limit: f64::INFINITY,
-        };
-        let rest = match (model, params) {
-            (
-                CameraModel::SimplePinhole
-                | CameraModel::SimpleRadial
-                | CameraModel::Radial
-                | CameraModel::SimpleRadialFisheye
-                | CameraModel::RadialFisheye
-                | CameraModel::SimpleFisheye,
-                &[f, cx, cy, ref rest @ ..],
-            ) => {
-                (camera.fx, camera.fy, camera.cx, camera.cy) = (f, f, cx, cy);
-                rest
-            }
-            (_, &[fx, fy, cx, cy, ref rest @ ..]) => {
-                (camera.fx, camera.fy, camera.cx, camera.cy) = (fx, fy, cx, cy);
-                rest
-            }
-            _ => return None,
-        };
-        match (model, rest) {
-            (
-                CameraModel::SimplePinhole
-                | CameraModel::Pinhole
-                | CameraModel::SimpleFisheye
-                | CameraModel::Fisheye,
-                [],
-            ) => {}
-            (CameraModel::SimpleRadial | CameraModel::SimpleRadialFisheye, &[k]) => {
-                camera.radial[0] = k;
-            }
-            (CameraModel::Radial | CameraModel::RadialFisheye, &[k1, k2]) => {
-                camera.radial = [k1, k2, 0.0, 0.0];
-            }
-            (CameraModel::Opencv, &[k1, k2, p1, p2]) => {
-                camera.radial = [k1, k2, 0.0, 0.0];
-                camera.tangential = [p1, p2];
-            }
-            (CameraModel::OpencvFisheye, &[k1, k2, k3, k4]) => camera.radial = [k1, k2, k3, k4],
-            (CameraModel::FullOpencv, &[k1, k2, p1, p2, k3, k4, k5, k6]) => {
-                camera.radial = [k1, k2, k3, 0.0];
-                camera.denominator = [k4, k5, k6];
-                camera.tangential = [p1, p2];
-            }
-            _ => return None,
-        }
-        camera.s_limit = camera.folding_limit();
-        Some(camera)
+            fx,
+            fy,
+            cx,
+            cy,
+            skew: 0.0,
+            lens: lens.unwrap_or_else(|| Lens::Polynomial(bend.limited())),
+        })
     }
 
     /// What makes this camera unusable, if anything: sizes of zero or beyond reason, focal lengths that are not positive and finite,
     /// other parameters that are not finite.
     pub fn fault(&self) -> Option<String> {
-        let coefficients = self
-            .radial
-            .iter()
-            .chain(&self.denominator)
-            .chain(&self.tangential);
         if self.width == 0 || self.height == 0 {
             Some(format!(
                 "has a picture size of {}x{}",
@@ -244,7 +308,7 @@ impl SourceCamera {
             Some("has a negative focal length".into())
         } else if !(self.cx.is_finite() && self.cy.is_finite()) {
             Some("has a principal point that is not a finite number".into())
-        } else if !coefficients.copied().all(f64::is_finite) {
+        } else if !(self.skew.is_finite() && self.lens.is_finite()) {
             Some("has a distortion parameter that is not a finite number".into())
         } else {
             None
@@ -253,65 +317,151 @@ impl SourceCamera {
 
     /// True when pixels are an affine function of rays: no distortion at all.
     pub fn is_pinhole(&self) -> bool {
-        !self.is_fisheye()
-            && all_zero(&self.radial)
-            && all_zero(&self.denominator)
-            && all_zero(&self.tangential)
+        self.lens == Lens::Polynomial(Polynomial::NONE)
     }
 
-    fn is_fisheye(&self) -> bool {
-        matches!(
-            self.model,
-            CameraModel::OpencvFisheye
-                | CameraModel::SimpleRadialFisheye
-                | CameraModel::RadialFisheye
-                | CameraModel::SimpleFisheye
-                | CameraModel::Fisheye
-        )
+    /// True when the picture holds all directions: no pinhole camera shows the same.
+    pub fn is_panorama(&self) -> bool {
+        self.lens == Lens::Equirectangular
     }
 
-    /// Pixel of the photograph that the ray `(u, v, 1)` falls on; it may lie outside the picture.
-    /// `None` where the model folds back on itself or the ray is not finite.
-    pub fn project(&self, ray: DVec2) -> Option<DVec2> {
-        let r2 = ray.length_squared();
-        if !r2.is_finite() {
-            return None;
-        }
-        let factor = if self.is_fisheye() {
-            let r = r2.sqrt();
-            let theta = r.atan();
-            if theta > self.s_limit {
-                return None;
-            }
-            // theta / r tends to 1 at the axis.
-            let scale = if r > 1e-9 { theta / r } else { 1.0 };
-            scale * self.radial_factor(theta * theta)
-        } else {
-            if r2 > self.s_limit * self.s_limit {
-                return None;
-            }
-            self.radial_factor(r2)
-        };
-        let [p1, p2] = self.tangential;
-        let (u, v) = (ray.x, ray.y);
-        let distorted = DVec2::new(
-            u * factor + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u),
-            v * factor + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v),
-        );
+    /// Pixel of the photograph that light from the direction `ray` (camera axes, any length) falls on; it may lie
+    /// outside the picture. `None` where the model folds back on itself, behind cameras that cannot see there, and
+    /// for rays that are not finite.
+    pub fn project(&self, ray: DVec3) -> Option<DVec2> {
+        let bent = self.lens.bend(ray)?;
         let pixel = DVec2::new(
-            self.fx * distorted.x + self.cx,
-            self.fy * distorted.y + self.cy,
+            self.fx * bent.x + self.skew * bent.y + self.cx,
+            self.fy * bent.y + self.cy,
         );
         pixel.is_finite().then_some(pixel)
+    }
+}
+
+impl Lens {
+    fn is_finite(&self) -> bool {
+        match *self {
+            Self::Polynomial(bend) => bend
+                .radial
+                .iter()
+                .chain(&bend.denominator)
+                .chain(&bend.tangential)
+                .chain(&bend.prism)
+                .all(|value| value.is_finite()),
+            Self::Fov { omega } => omega.is_finite(),
+            Self::Division { k } => k.is_finite(),
+            Self::Eucm { alpha, beta } => alpha.is_finite() && beta.is_finite(),
+            Self::Equirectangular => true,
+        }
+    }
+
+    /// Where a ray meets the picture at focal length 1.
+    fn bend(&self, ray: DVec3) -> Option<DVec2> {
+        if !ray.is_finite() {
+            return None;
+        }
+        let axial = ray.truncate();
+        match *self {
+            Self::Polynomial(bend) if bend.fisheye => bend.apply_fisheye(ray),
+            Self::Eucm { alpha, beta } => {
+                let distance = (beta * axial.length_squared() + ray.z * ray.z).sqrt();
+                let depth = alpha * distance + (1.0 - alpha) * ray.z;
+                // Beyond this cone two directions share a pixel.
+                let edge = if alpha > 0.5 {
+                    (alpha - 1.0) / alpha
+                } else {
+                    alpha / (alpha - 1.0)
+                };
+                (depth > 0.0 && ray.z > edge * distance).then(|| axial / depth)
+            }
+            Self::Equirectangular => {
+                let longitude = ray.x.atan2(ray.z);
+                let latitude = ray.y.atan2(ray.x.hypot(ray.z));
+                (ray.length_squared() > 0.0).then(|| DVec2::new(longitude, latitude))
+            }
+            _ if ray.z <= 0.0 => None,
+            Self::Polynomial(bend) => bend.apply(axial / ray.z),
+            Self::Fov { omega } => {
+                let at = axial / ray.z;
+                let radius = at.length();
+                let scale = 2.0 * (omega / 2.0).tan();
+                // Both angles tend to their tangents at 0, and so does the quotient.
+                let bent = if omega.abs() < 1e-9 {
+                    radius
+                } else {
+                    (radius * scale).atan() / omega
+                };
+                Some(if radius > 1e-12 {
+                    at * (bent / radius)
+                } else {
+                    at
+                })
+            }
+            Self::Division { k } => {
+                let at = axial / ray.z;
+                let root = 1.0 - 4.0 * k * at.length_squared();
+                (root >= 0.0).then(|| at * (2.0 / (1.0 + root.sqrt())))
+            }
+        }
+    }
+}
+
+impl Polynomial {
+    const NONE: Self = Self {
+        fisheye: false,
+        radial: [0.0; 6],
+        denominator: [0.0; 3],
+        tangential: [0.0; 2],
+        prism: [0.0; 4],
+        radial_first: false,
+        s_limit: f64::INFINITY,
+    };
+
+    /// With its limit found.
+    pub(crate) fn limited(mut self) -> Self {
+        self.s_limit = self.folding_limit();
+        self
+    }
+
+    fn apply(&self, at: DVec2) -> Option<DVec2> {
+        let s2 = at.length_squared();
+        (s2 <= self.s_limit * self.s_limit).then(|| self.terms(at, self.radial_factor(s2)))
+    }
+
+    fn apply_fisheye(&self, ray: DVec3) -> Option<DVec2> {
+        let axial = ray.truncate();
+        let radius = axial.length();
+        let theta = radius.atan2(ray.z);
+        if theta > self.s_limit || (radius == 0.0 && ray.z <= 0.0) {
+            return None;
+        }
+        // theta / radius tends to 1 / z at the axis.
+        let scale = if radius > 1e-9 * ray.z.abs() {
+            theta / radius
+        } else {
+            ray.z.recip()
+        };
+        Some(self.terms(axial * scale, self.radial_factor(theta * theta)))
+    }
+
+    /// Radial factor, tangential and prism terms at `(u, v)`.
+    fn terms(&self, at: DVec2, factor: f64) -> DVec2 {
+        let moved = at * factor;
+        let q = if self.radial_first { moved } else { at };
+        let q2 = q.length_squared();
+        let ([p1, p2], [x2, x4, y2, y4]) = (self.tangential, self.prism);
+        moved
+            + DVec2::new(
+                2.0 * p1 * q.x * q.y + p2 * (q2 + 2.0 * q.x * q.x) + q2 * (x2 + x4 * q2),
+                2.0 * p2 * q.x * q.y + p1 * (q2 + 2.0 * q.y * q.y) + q2 * (y2 + y4 * q2),
+            )
     }
 
     /// g(s) for `s2 = s^2`.
     fn radial_factor(&self, s2: f64) -> f64 {
-        let [a1, a2, a3, a4] = self.radial;
         let [b1, b2, b3] = self.denominator;
-        let numerator = 1.0 + s2 * (a1 + s2 * (a2 + s2 * (a3 + s2 * a4)));
-        let denominator = 1.0 + s2 * (b1 + s2 * (b2 + s2 * b3));
-        numerator / denominator
+        let numerator = self.radial.iter().rev().fold(0.0, |sum, a| s2 * (a + sum));
+        (1.0 + numerator) / (1.0 + s2 * (b1 + s2 * (b2 + s2 * b3)))
     }
 
     /// The s at which `s g(s)` stops growing, by scanning in small steps.
@@ -320,8 +470,8 @@ impl SourceCamera {
         if all_zero(&self.radial) && all_zero(&self.denominator) {
             return f64::INFINITY;
         }
-        let end = if self.is_fisheye() {
-            RADIUS_SCANNED.atan()
+        let end = if self.fisheye {
+            std::f64::consts::PI
         } else {
             RADIUS_SCANNED
         };
@@ -369,9 +519,9 @@ mod tests {
             &[50.0, 50.0, 40.0, -0.2],
         )
         .expect("four parameters");
-        assert!(camera.project(DVec2::new(1.2, 0.0)).is_some());
-        assert!(camera.project(DVec2::new(1.4, 0.0)).is_none());
-        assert!(camera.project(DVec2::new(f64::NAN, 0.0)).is_none());
+        assert!(camera.project(DVec3::new(1.2, 0.0, 1.0)).is_some());
+        assert!(camera.project(DVec3::new(1.4, 0.0, 1.0)).is_none());
+        assert!(camera.project(DVec3::new(f64::NAN, 0.0, 1.0)).is_none());
     }
 
     #[test]

@@ -7,6 +7,7 @@ use std::collections::BTreeSet;
 use std::io;
 use std::path::Path;
 
+use glam::DMat3;
 use ign_geometry::{Camera, CameraIntrinsics};
 use image::{DynamicImage, ImageError};
 use rayon::prelude::*;
@@ -195,6 +196,8 @@ fn check_view(
                 name: image.name.clone(),
                 camera,
                 source,
+                source_from_camera: DMat3::IDENTITY,
+                rolled_columns: 0,
                 image_path,
                 mask_path,
             },

@@ -15,7 +15,7 @@
 
 use std::path::Path;
 
-use glam::DVec2;
+use glam::{DMat3, DVec2};
 use ign_geometry::{Camera, CameraIntrinsics};
 use rayon::prelude::*;
 
@@ -63,9 +63,11 @@ impl Scene {
         let map = PixelMap {
             target: camera.intrinsics,
             source: view.source,
+            source_from_target: view.source_from_camera,
         };
-        let photograph = decode(view, &view.image_path)?.into_rgb8();
-        let (rgb, inside) = resample::<3>(photograph.as_raw(), &map);
+        let mut photograph = decode(view, &view.image_path)?.into_rgb8().into_raw();
+        roll::<3>(&mut photograph, view);
+        let (rgb, inside) = resample::<3>(&photograph, &map);
         drop(photograph);
         let mask = match &view.mask_path {
             Some(path) => {
@@ -75,6 +77,7 @@ impl Scene {
                         *value = 255 - *value;
                     }
                 }
+                roll::<1>(&mut mask, view);
                 Some(resample::<1>(&mask, &map).0)
             }
             None => None,
@@ -86,6 +89,15 @@ impl Scene {
             mask,
             inside,
         })
+    }
+}
+
+/// Rolls rows of `C` interleaved channels as the view says.
+fn roll<const C: usize>(data: &mut [u8], view: &View) {
+    if view.rolled_columns > 0 {
+        for row in data.chunks_exact_mut(view.source.width as usize * C) {
+            row.rotate_left(view.rolled_columns * C);
+        }
     }
 }
 
@@ -114,6 +126,7 @@ fn decode(view: &View, path: &Path) -> Result<image::DynamicImage, ImportError> 
 struct PixelMap {
     target: CameraIntrinsics,
     source: SourceCamera,
+    source_from_target: DMat3,
 }
 
 /// A box in the photograph: centre and widths, in pixels.
@@ -125,9 +138,8 @@ struct Footprint {
 
 impl PixelMap {
     fn at(&self, px: DVec2) -> Option<DVec2> {
-        let i = &self.target;
         self.source
-            .project(DVec2::new((px.x - i.cx) / i.fx, (px.y - i.cy) / i.fy))
+            .project(self.source_from_target * self.target.ray(px))
     }
 
     /// The box of the module's text for the pixel whose centre is `px`; `None` outside the lens model's range.

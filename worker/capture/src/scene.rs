@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use ign_geometry::{Camera, Mesh};
 use serde::{Deserialize, Serialize};
 
@@ -60,10 +60,15 @@ pub struct View {
     /// The image name in the model, which is the path below `images/`.
     pub name: String,
     /// The undistorted pinhole camera: the photograph's size, focal lengths and principal point without its
-    /// distortion, in the world frame.
+    /// distortion, in the world frame. For a panorama, a pinhole camera at its centre that looks at the proxy.
     pub camera: Camera,
     /// The camera as the model has it, with distortion.
     pub source: SourceCamera,
+    /// Rotation from the axes of `camera` to those of `source`; the identity for all but panoramas.
+    pub source_from_camera: DMat3,
+    /// How many columns the photograph is rolled to the left before it is looked at, so that a panorama's seam lies
+    /// opposite the object; `source_from_camera` leads to the rolled picture. 0 for all but panoramas.
+    pub(crate) rolled_columns: usize,
     /// The photograph.
     pub image_path: PathBuf,
     /// Its mask, where the capture has masks.

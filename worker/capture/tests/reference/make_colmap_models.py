@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Writes small COLMAP models, one per camera model, with pixels as COLMAP itself projects them.
 
-    python -m venv /tmp/venv && /tmp/venv/bin/pip install pycolmap==4.2.1 numpy
+    python -m venv /tmp/venv && /tmp/venv/bin/pip install pycolmap==4.2.0 numpy
     /tmp/venv/bin/python make_colmap_models.py
 
 Each folder gets the model in binary and text form and `projections.txt`, one line per observation:
@@ -28,6 +28,17 @@ PARAMS = {
     "RADIAL_FISHEYE": [88.0, 45.5, 37.25, -0.07, 0.02],
     "SIMPLE_FISHEYE": [88.0, 45.5, 37.25],
     "FISHEYE": [88.0, 92.5, 45.5, 37.25],
+    "FOV": [88.0, 92.5, 45.5, 37.25, 0.85],
+    "THIN_PRISM_FISHEYE": [
+        88.0, 92.5, 45.5, 37.25, -0.05, 0.02, 0.004, -0.007, -0.01, 0.003, 0.006, -0.005,
+    ],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [
+        88.0, 92.5, 45.5, 37.25, -0.05, 0.02, -0.01, 0.003, -0.002, 0.001, 0.004, -0.007, 0.006, 0.003, -0.005, 0.002,
+    ],
+    "SIMPLE_DIVISION": [88.0, 45.5, 37.25, -0.11],
+    "DIVISION": [88.0, 92.5, 45.5, 37.25, -0.13],
+    "EUCM": [88.0, 92.5, 45.5, 37.25, 0.62, 1.08],
+    "EQUIRECTANGULAR": [96.0, 70.0],
 }
 IMAGES = 3
 POINTS = 12

@@ -1,9 +1,10 @@
 //! Views loaded into the pixels of a camera: where things land, and what the filter yields.
 
+use std::fmt::Write as _;
 use std::path::Path;
 
 use crate::common::{Capture, HEIGHT, PINHOLE, VIEWS, WIDTH};
-use glam::{DVec2, DVec3};
+use glam::{DAffine3, DQuat, DVec2, DVec3};
 use ign_capture::{Frame, ImportOptions, Scene, ViewImage, import};
 use ign_geometry::Camera;
 
@@ -49,8 +50,10 @@ fn a_point_lands_where_its_camera_projects_it_for_every_lens() {
                 .camera
                 .camera_from_world
                 .transform_point3(point);
-            let ray = DVec2::new(in_camera.x, in_camera.y) / in_camera.z;
-            let source_px = scene.views[view].source.project(ray).expect("a pixel");
+            let source_px = scene.views[view]
+                .source
+                .project(in_camera)
+                .expect("a pixel");
             capture.photograph(view, disc(source_px, 2.0));
             let frames = [
                 Frame::Whole { long_side: 80 },
@@ -71,6 +74,76 @@ fn a_point_lands_where_its_camera_projects_it_for_every_lens() {
                     "{lens}, view {view}, {frame:?}: off by {off} px"
                 );
             }
+        }
+    }
+}
+
+/// Panoramas have no pinhole: each view gets one that looks at the object, wherever the panorama's seam lies.
+#[test]
+fn a_point_lands_where_it_is_in_a_panorama() {
+    let capture = Capture::with_camera("1 EQUIRECTANGULAR 80 60 80 60");
+    let point = DVec3::new(0.21, -0.17, 0.13);
+    for yaw in [0.0_f64, 1.1, 2.9, -3.1] {
+        // The same places, with each panorama turned about its own vertical axis.
+        let mut images = String::new();
+        let turned =
+            |view: usize| DAffine3::from_rotation_y(yaw) * Capture::camera(view).camera_from_world;
+        for view in 0..8 {
+            let (q, t) = (
+                DQuat::from_mat3(&turned(view).matrix3),
+                turned(view).translation,
+            );
+            writeln!(
+                images,
+                "{} {} {} {} {} {} {} {} 1 {}\n",
+                view + 1,
+                q.w,
+                q.x,
+                q.y,
+                q.z,
+                t.x,
+                t.y,
+                t.z,
+                Capture::name(view)
+            )
+            .expect("a line");
+        }
+        capture.write("sparse/0/images.txt", &images);
+        let scene = capture.import();
+        assert_eq!(scene.views.len(), 8);
+        for view in [0, 3, 7] {
+            let ray = turned(view).transform_point3(point);
+            // A soft cone around the point's direction.
+            let cone = |looking: DVec3, center: DVec3| {
+                (1.0 - looking.angle_between(center) / 0.15).max(0.0)
+            };
+            capture.photograph(view, |x, y| {
+                let longitude = ((f64::from(x) + 0.5) / 80.0 - 0.5) * std::f64::consts::TAU;
+                let latitude = ((f64::from(y) + 0.5) / 60.0 - 0.5) * std::f64::consts::PI;
+                let looking = DVec3::new(
+                    longitude.sin() * latitude.cos(),
+                    latitude.sin(),
+                    longitude.cos() * latitude.cos(),
+                );
+                [(cone(looking, ray) * 255.0).round() as u8; 3]
+            });
+            let frame = Frame::Object {
+                size: 26,
+                margin: 0.8,
+            };
+            let camera = scene.frame_camera(view, &frame, 1);
+            let image = scene.load_view(view, &camera).expect("a picture");
+            // The cone as the pinhole camera sees it.
+            let center = camera.camera_from_world.transform_point3(point);
+            let mut ideal = image.clone();
+            for (at, value) in ideal.rgb.chunks_exact_mut(3).enumerate() {
+                let px = DVec2::new((at % 26) as f64 + 0.5, (at / 26) as f64 + 0.5);
+                value.fill(cone(camera.intrinsics.ray(px), center) as f32);
+            }
+            // Some levels across two pixels of the panorama each: a tenth of a pixel.
+            let off = centroid(&image).distance(centroid(&ideal));
+            assert!(off < 0.1, "turned by {yaw}, view {view}: off by {off} px");
+            assert!(image.inside.iter().all(|&share| share > 0.999));
         }
     }
 }

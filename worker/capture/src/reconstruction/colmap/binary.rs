@@ -8,7 +8,7 @@ use std::io::{self, BufRead, BufReader, Read};
 
 use glam::DVec3;
 
-use super::{Source, UNSUPPORTED_HINT, pose};
+use super::{REEXPORT_HINT, Source, pose};
 use crate::distortion::{ModelKind, SourceCamera};
 use crate::fault::Faults;
 use crate::reconstruction::{Model, ModelImage, ModelPoint, add_camera};
@@ -206,22 +206,18 @@ fn read_cameras(
         for _ in 0..kind.params {
             params.push(bytes.f64()?);
         }
-        let camera = match (u32::try_from(width), u32::try_from(height), kind.model) {
-            (Ok(width), Ok(height), Some(model)) => {
-                SourceCamera::from_params(model, width, height, &params).ok_or_else(|| {
+        let camera = match (u32::try_from(width), u32::try_from(height)) {
+            (Ok(width), Ok(height)) => {
+                SourceCamera::from_params(kind.model, width, height, &params).ok_or_else(|| {
                     (
                         format!("has the wrong number of parameters for {}", kind.name),
-                        UNSUPPORTED_HINT,
+                        REEXPORT_HINT,
                     )
                 })
             }
-            (_, _, None) => Err((
-                format!("has the model {}, which is not supported", kind.name),
-                UNSUPPORTED_HINT,
-            )),
             _ => Err((
                 format!("has a picture size of {width}x{height}"),
-                "re-export the model",
+                REEXPORT_HINT,
             )),
         };
         add_camera(model, faults, id, &bytes.at(source), camera);

@@ -121,9 +121,8 @@ fn pose(values: &[f64; 7]) -> Result<DAffine3, &'static str> {
     ))
 }
 
-/// Names of the models that can be imported, for hints.
-const UNSUPPORTED_HINT: &str =
-    "undistort the photographs with COLMAP's image_undistorter, which writes PINHOLE cameras";
+/// For entries that no export of today writes.
+const REEXPORT_HINT: &str = "re-export the model with a current version of COLMAP";
 
 #[cfg(test)]
 mod tests;

@@ -36,9 +36,7 @@ fn read_all(dir: &Path) -> (Model, Vec<Fault>) {
 fn project(model: &Model, image: &ModelImage, point: DVec3) -> DVec2 {
     let source = model.cameras[&image.camera_id].expect("a sound camera");
     let in_camera = image.camera_from_world.transform_point3(point);
-    source
-        .project(DVec2::new(in_camera.x, in_camera.y) / in_camera.z)
-        .expect("a pixel")
+    source.project(in_camera).expect("a pixel")
 }
 
 #[test]
@@ -79,7 +77,7 @@ fn projections_agree_with_pycolmap_for_every_camera_model() {
         }
         models += 1;
     }
-    assert_eq!(models, 11);
+    assert_eq!(models, 18);
 }
 
 #[test]
@@ -175,7 +173,7 @@ fn damaged_bytes_never_panic() {
                 fs::write(&path, &bytes).expect("written");
                 let (model, _) = read_all(dir.path());
                 for camera in model.cameras.values().flatten() {
-                    camera.project(DVec2::new(0.3, -0.2));
+                    camera.project(DVec3::new(0.3, -0.2, 1.0));
                 }
             }
             fs::write(&path, &whole).expect("written");
@@ -187,7 +185,7 @@ fn damaged_bytes_never_panic() {
 fn faulty_cameras_are_named_with_their_line() {
     let dir = copied("pinhole", "txt");
     let text = "# comment\n7 PINHOLE 96 70 0 92.5 45.5 37.25\n8 SIMPLE_RADIAL 96 70 nan 45.5 37 0\n\
-                9 FOV 96 70 88 88 45 37 0.1\n10 CUBIC 96 70 1\n11 PINHOLE 96 70 88 88 45\nx\n\
+                9 FOV 96 70 88 88 45 37 inf\n10 CUBIC 96 70 1\n11 PINHOLE 96 70 88 88 45\nx\n\
                 12 PINHOLE 96 70 88 88 45 37 1\n7 PINHOLE 96 70 9 92.5 45.5 37.25\n";
     fs::write(dir.path().join("sparse/0/cameras.txt"), text).expect("written");
     let (_, faults) = read_all(dir.path());
@@ -195,7 +193,10 @@ fn faulty_cameras_are_named_with_their_line() {
     let expected = [
         (2, "camera 7 has zero focal length"),
         (3, "camera 8 has a focal length that is not a finite number"),
-        (4, "camera 9 has the model FOV, which is not supported"),
+        (
+            4,
+            "camera 9 has a distortion parameter that is not a finite number",
+        ),
         (5, "camera 10 has the unknown model CUBIC"),
         (
             6,

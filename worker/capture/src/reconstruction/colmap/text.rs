@@ -6,7 +6,7 @@ use std::str::{FromStr, SplitAsciiWhitespace};
 
 use glam::DVec3;
 
-use super::{Source, UNSUPPORTED_HINT, pose};
+use super::{REEXPORT_HINT, Source, pose};
 use crate::distortion::{ModelKind, SourceCamera};
 use crate::fault::Faults;
 use crate::reconstruction::{Model, ModelImage, ModelPoint, add_camera};
@@ -107,7 +107,7 @@ fn camera(words: &mut SplitAsciiWhitespace<'_>) -> Result<SourceCamera, (String,
         .next()
         .ok_or_else(|| garbled("the line ends before the model's name".into()))?;
     let kind = ModelKind::by_name(name)
-        .ok_or_else(|| (format!("has the unknown model {name}"), UNSUPPORTED_HINT))?;
+        .ok_or_else(|| (format!("has the unknown model {name}"), REEXPORT_HINT))?;
     let width = number(words, "the width").map_err(garbled)?;
     let height = number(words, "the height").map_err(garbled)?;
     let mut params = Vec::with_capacity(kind.params);
@@ -120,14 +120,12 @@ fn camera(words: &mut SplitAsciiWhitespace<'_>) -> Result<SourceCamera, (String,
             kind.params
         )));
     }
-    kind.model
-        .and_then(|model| SourceCamera::from_params(model, width, height, &params))
-        .ok_or_else(|| {
-            (
-                format!("has the model {name}, which is not supported"),
-                UNSUPPORTED_HINT,
-            )
-        })
+    SourceCamera::from_params(kind.model, width, height, &params).ok_or_else(|| {
+        (
+            format!("has the wrong number of parameters for {name}"),
+            REEXPORT_HINT,
+        )
+    })
 }
 
 pub(super) fn images(source: &Source, model: &mut Model, faults: &mut Faults) {
