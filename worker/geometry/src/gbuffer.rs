@@ -195,20 +195,23 @@ fn attributes(
     let corners = mesh.triangles[triangle as usize].map(|corner| corner as usize);
     let [a, b, c] = corners.map(|corner| mesh.positions[corner]);
     let position = a * weights[0] + b * weights[1] + c * weights[2];
+    if !position.as_vec3().is_finite() {
+        return None;
+    }
     let view = (position - eye).try_normalize()?;
     let face = (b - a).cross(c - a);
     let face = if face.dot(view) > 0.0 { -face } else { face };
+    // The side is the face's, at each corner by itself: a vertex of triangles with mixed winding points anywhere, and an
+    // interpolated normal alone would flip in the middle of a silhouette's triangle.
     let normal = corners
         .iter()
         .zip(weights)
-        .map(|(corner, weight)| mesh.normals.get(*corner).copied().unwrap_or_default() * weight)
+        .map(|(corner, weight)| {
+            let normal = mesh.normals.get(*corner).copied().unwrap_or_default();
+            let side = if normal.dot(face) < 0.0 { -1.0 } else { 1.0 };
+            normal * side * weight
+        })
         .sum::<DVec3>();
-    // The side is the face's; an interpolated normal alone would flip in the middle of a silhouette's triangle.
-    let normal = if normal.dot(face) < 0.0 {
-        -normal
-    } else {
-        normal
-    };
     let normal = facing(normal, view)
         .or_else(|| facing(face, view))
         .unwrap_or(-view);

@@ -12,6 +12,10 @@ use crate::Similarity;
 /// Refinement steps of the bounding sphere; its radius is then within about 1 % of the smallest possible.
 const SPHERE_STEPS: u32 = 100;
 
+/// Cosine of the angle between two faces at a vertex beyond which they are taken to be wound against each other. No
+/// corner of an object is near it, as a box's is near 0: there a rounding would decide.
+const OPPOSITE_COSINE: f64 = -0.5;
+
 /// Why a mesh cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -95,7 +99,7 @@ pub struct Mesh {
 
 impl Mesh {
     /// A mesh from positions and triangles. Degenerate triangles (repeated vertex, no area) are dropped; normals are
-    /// the area-weighted mean of the adjacent faces' normals.
+    /// the area-weighted mean of the adjacent faces' normals, whichever way round these are wound.
     ///
     /// # Errors
     /// [`MeshError`] for coordinates that are not finite, indices out of range, or no triangle left.
@@ -125,18 +129,7 @@ impl Mesh {
         if kept.is_empty() {
             return Err(MeshError::NoTriangles { triangles: count });
         }
-        let mut sums = vec![DVec3::ZERO; positions.len()];
-        for &corners in &kept {
-            // Twice the area times the unit normal: the sum is area-weighted by itself.
-            let vector = face_vector(&positions, corners);
-            for corner in corners {
-                sums[corner as usize] += vector;
-            }
-        }
-        let normals = sums
-            .into_iter()
-            .map(|sum| unit(sum).unwrap_or(DVec3::Z))
-            .collect();
+        let normals = vertex_normals(&positions, &kept);
         Ok(Self {
             positions,
             normals,
@@ -224,6 +217,45 @@ impl Mesh {
             ..self.clone()
         }
     }
+}
+
+/// Area-weighted mean of the normals of the faces around each vertex; `+z` where there are none.
+///
+/// Scans hold triangles that are wound the wrong way round, and surfaces that are doubled back to back: summed up as
+/// they are, such faces cancel, and what is left is rounding. So a face that points against the largest one at its
+/// vertex counts with the opposite sign, and the majority decides which side is outside.
+fn vertex_normals(positions: &[DVec3], triangles: &[[u32; 3]]) -> Vec<DVec3> {
+    // Twice the area times the unit normal: a sum is area-weighted by itself.
+    let faces = || {
+        triangles
+            .iter()
+            .map(|&corners| (corners, face_vector(positions, corners)))
+    };
+    let mut largest = vec![(0.0, DVec3::ZERO); positions.len()];
+    for (corners, vector) in faces() {
+        let size = vector.abs().max_element();
+        for corner in corners {
+            let largest = &mut largest[corner as usize];
+            if size > largest.0 {
+                *largest = (size, vector / size);
+            }
+        }
+    }
+    let mut sums = vec![(DVec3::ZERO, 0.0); positions.len()];
+    for (corners, vector) in faces() {
+        for corner in corners {
+            let (size, direction) = largest[corner as usize];
+            let along = (vector / size).dot(direction);
+            let limit = OPPOSITE_COSINE * (vector / size).length() * direction.length();
+            let sign = if along < limit { -1.0 } else { 1.0 };
+            let (sum, side) = &mut sums[corner as usize];
+            *sum += vector / size * sign;
+            *side += along;
+        }
+    }
+    sums.into_iter()
+        .map(|(sum, side)| unit(if side < 0.0 { -sum } else { sum }).unwrap_or(DVec3::Z))
+        .collect()
 }
 
 /// Normal of a triangle, as long as twice its area.

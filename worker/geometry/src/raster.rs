@@ -10,7 +10,7 @@
 //! - *Deterministic.* The nearest surface wins, ties go to the lower triangle index; neither threads nor the order of
 //!   drawing matter.
 //! - Both sides of a triangle are drawn: proxies of real captures are open and their winding is not reliable.
-//! - Whatever is not finite is not drawn.
+//! - Whatever is not finite, also as the f32 that maps are made of, is not drawn.
 
 use std::ops::Range;
 
@@ -65,11 +65,11 @@ pub fn rasterize(mesh: &Mesh, camera: &Camera) -> Raster {
             let rows = bins.rows(band);
             nearest(&scene, &bins, band, 1, width, keys);
             for (index, (pixel, key)) in pixels.iter_mut().zip(keys.iter()).enumerate() {
-                if let Some(triangle) = key_triangle(*key) {
-                    let place =
-                        DVec2::new((index % width) as f64, (rows.start + index / width) as f64);
-                    let surface = scene.surface(triangle, place + 0.5);
-                    *pixel = (surface.map_or(0.0, |(_, depth)| depth as f32), triangle);
+                let place = DVec2::new((index % width) as f64, (rows.start + index / width) as f64);
+                if let Some(triangle) = key_triangle(*key)
+                    && let Some((_, depth)) = scene.surface(triangle, place + 0.5)
+                {
+                    *pixel = (depth as f32, triangle);
                 }
             }
         });
@@ -222,17 +222,18 @@ impl<'a> Projected<'a> {
         }
     }
 
-    /// Corner weights and depth where the ray through `px` meets a triangle.
+    /// Corner weights and depth where the ray through `px` meets a triangle; `None` when it is seen edge-on, up to
+    /// rounding, or so far or near that f32 cannot hold its depth.
     pub(crate) fn surface(&self, triangle: u32, px: DVec2) -> Option<([f64; 3], f64)> {
         let points =
             self.mesh.triangles[triangle as usize].map(|corner| self.points[corner as usize]);
         let weights = weights(points, self.camera.intrinsics.ray(px))?;
-        let depth = weights
+        let depth: f64 = weights
             .iter()
             .zip(&points)
             .map(|(weight, point)| weight * point.z)
             .sum();
-        Some((weights, depth))
+        (depth as f32 > 0.0 && (depth as f32).is_finite()).then_some((weights, depth))
     }
 
     /// Calls `put(row, column, 1/depth)` for each sample that a triangle covers, within the pixel rows `rows` of an

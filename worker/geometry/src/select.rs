@@ -243,7 +243,8 @@ pub fn select_references(views: &[GBuffer], n: usize) -> Vec<usize> {
 }
 
 /// Chooses the `min(k, references.len())` references that a target view is best made from, in the order of choice,
-/// without repeats. A reference with the pose of a chosen one is taken only when no other is left.
+/// without repeats. A reference that stands where a chosen one does is taken only when no other is left. Which ones are
+/// chosen does not depend on the order of the references.
 pub fn select_nearest(
     target: &GBuffer,
     references: &[GBuffer],
@@ -268,18 +269,28 @@ pub fn select_nearest(
             samples.iter().map(weight).collect()
         })
         .collect();
-    let same_pose = |a: usize, b: usize| {
-        references[a].camera.camera_from_world == references[b].camera.camera_from_world
+    let middle =
+        samples.iter().map(|sample| sample.position).sum::<DVec3>() / samples.len().max(1) as f64;
+    let near_duplicate = |a: usize, b: usize| {
+        let distance = centers[a].distance(middle).min(centers[b].distance(middle));
+        centers[a].distance(centers[b]) <= DUPLICATE_SHARE * distance
     };
 
     let mut residual = vec![1.0_f64; samples.len()];
+    // Of equals the first is chosen: the first by place, not by the caller's order.
     let mut left: Vec<usize> = (0..references.len()).collect();
+    left.sort_by(|a, b| {
+        let (a, b) = (centers[*a], centers[*b]);
+        (a.x.total_cmp(&b.x))
+            .then(a.y.total_cmp(&b.y))
+            .then(a.z.total_cmp(&b.z))
+    });
     let mut chosen: Vec<usize> = Vec::new();
     while chosen.len() < k && !left.is_empty() {
         let mut fresh: Vec<usize> = left
             .iter()
             .copied()
-            .filter(|view| !chosen.iter().any(|other| same_pose(*view, *other)))
+            .filter(|view| !chosen.iter().any(|other| near_duplicate(*view, *other)))
             .collect();
         if fresh.is_empty() {
             fresh.clone_from(&left);

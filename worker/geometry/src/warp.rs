@@ -88,7 +88,8 @@ impl GBuffer {
         let focal = 0.5 * (self.camera.intrinsics.fx + self.camera.intrinsics.fy);
         let footprint = seen.depth / focal / cos.max(options.min_cos);
         let bias = options.relative_bias * seen.depth + options.slope_footprints * footprint;
-        (weight > 0.0 && seen.depth <= depth / weight + bias).then_some(Seen { px: seen.px, cos })
+        let surface = depth / weight;
+        (surface.is_finite() && seen.depth <= surface + bias).then_some(Seen { px: seen.px, cos })
     }
 }
 

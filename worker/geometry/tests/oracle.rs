@@ -1,5 +1,5 @@
 //! A second, deliberately plain implementation judges the fast one: every ray against every triangle, one pixel after
-//! the other, all in f64, written from the definitions and sharing no code with the crate but its data types.
+//! the other, all in f64 (`ign_scenes::oracle`).
 //!
 //! Scenes are asymmetric on purpose (width and height differ, the principal point is off centre, rotations are
 //! general, the surface is curved and hides parts of itself), or axis swaps and half-pixel errors would pass.
@@ -14,6 +14,7 @@ use ign_geometry::{
     Camera, CameraIntrinsics, GBuffer, Mesh, NO_TRIANGLE, WarpOptions, barycentric, coverage_map,
     cross_project, rasterize,
 };
+use ign_scenes::oracle::{bilinear, cast, margin, pixels, ray, surface_point};
 use proptest::prelude::{ProptestConfig, prop_assert, prop_assert_eq, proptest};
 
 /// A torus with bumps, tilted: its tube hides its far side, and itself.
@@ -66,56 +67,6 @@ fn ring(count: u32) -> Vec<Camera> {
     (0..count)
         .map(|i| camera(turn(i, count), 0.7 * (f64::from(i) * 1.7).sin(), 3.0))
         .collect()
-}
-
-/// Nearest hit of a ray from `origin`: distance in units of `direction`, triangle, smallest corner weight.
-struct Hit {
-    distance: f64,
-    triangle: usize,
-    weights: [f64; 3],
-}
-
-fn cast(mesh: &Mesh, origin: DVec3, direction: DVec3) -> Option<Hit> {
-    let mut nearest: Option<Hit> = None;
-    for (triangle, corners) in mesh.triangles.iter().enumerate() {
-        let [a, b, c] = corners.map(|corner| mesh.positions[corner as usize]);
-        // Where the ray meets the plane, then the three sub-areas.
-        let normal = (b - a).cross(c - a);
-        let distance = (a - origin).dot(normal) / direction.dot(normal);
-        if !(distance > 0.0 && nearest.as_ref().is_none_or(|hit| distance < hit.distance)) {
-            continue;
-        }
-        let point = origin + direction * distance;
-        let area =
-            |p: DVec3, q: DVec3| (p - point).cross(q - point).dot(normal) / normal.length_squared();
-        let weights = [area(b, c), area(c, a), area(a, b)];
-        if weights.iter().all(|weight| *weight >= 0.0) {
-            nearest = Some(Hit {
-                distance,
-                triangle,
-                weights,
-            });
-        }
-    }
-    nearest
-}
-
-/// The ray through an image point, scaled so that distances along it are depths.
-fn ray(camera: &Camera, x: f64, y: f64) -> (DVec3, DVec3) {
-    let k = &camera.intrinsics;
-    let rotation = camera.camera_from_world.matrix3.inverse();
-    let origin = rotation * -camera.camera_from_world.translation;
-    (
-        origin,
-        rotation * DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0),
-    )
-}
-
-fn pixels(camera: &Camera) -> impl Iterator<Item = (usize, u32, u32)> + use<> {
-    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-    (0..height).flat_map(move |row| {
-        (0..width).map(move |column| ((row * width + column) as usize, column, row))
-    })
 }
 
 #[test]
@@ -376,66 +327,6 @@ fn picture(camera: &Camera) -> Vec<f32> {
     pixels(camera)
         .flat_map(|(_, column, row)| [0, 1, 2].map(|channel| wave(column, row, channel)))
         .collect()
-}
-
-/// Bilinear sample of one channel of a map, with repeated border, and of the covered pixels alone.
-fn bilinear(value: impl Fn(usize) -> Option<f64>, camera: &Camera, px: DVec2) -> Option<f64> {
-    let (width, height) = (
-        i64::from(camera.intrinsics.width),
-        i64::from(camera.intrinsics.height),
-    );
-    let (mut sum, mut total) = (0.0, 0.0);
-    for dy in 0..2 {
-        for dx in 0..2 {
-            let (column, row) = (
-                (px.x - 0.5).floor() as i64 + dx,
-                (px.y - 0.5).floor() as i64 + dy,
-            );
-            // A pixel's weight falls linearly from 1 at its centre to 0 at its neighbour's.
-            let weight_x = 1.0 - (px.x - (column as f64 + 0.5)).abs();
-            let weight_y = 1.0 - (px.y - (row as f64 + 0.5)).abs();
-            let index = row.clamp(0, height - 1) * width + column.clamp(0, width - 1);
-            if let Some(value) = value(index as usize) {
-                sum += weight_x * weight_y * value;
-                total += weight_x * weight_y;
-            }
-        }
-    }
-    (total > 0.0).then_some(sum / total)
-}
-
-/// How far a point is from being rejected by the depth test (positive: seen), or `None` for other reasons.
-fn margin(source: &GBuffer, position: DVec3, normal: DVec3, options: &WarpOptions) -> Option<f64> {
-    let k = &source.camera.intrinsics;
-    let point = source.camera.camera_from_world.transform_point3(position);
-    let px = DVec2::new(
-        k.fx * point.x / point.z + k.cx,
-        k.fy * point.y / point.z + k.cy,
-    );
-    if point.z <= 0.0
-        || px.x < 0.0
-        || px.y < 0.0
-        || px.x > f64::from(k.width)
-        || px.y > f64::from(k.height)
-    {
-        return None;
-    }
-    let eye = ray(&source.camera, 0.0, 0.0).0;
-    let cos = normal.dot(eye - position) / (eye - position).length();
-    if cos < options.grazing_cos {
-        return None;
-    }
-    let depth = |index: usize| source.mask[index].then(|| f64::from(source.depth[index]));
-    let surface = bilinear(depth, &source.camera, px)?;
-    let footprint = point.z / (0.5 * (k.fx + k.fy));
-    let bias = options.relative_bias * point.z
-        + options.slope_footprints * footprint / cos.max(options.min_cos);
-    Some(surface + bias - point.z)
-}
-
-fn surface_point(buffer: &GBuffer, index: usize) -> (DVec3, DVec3) {
-    let vector = |map: &[[f32; 3]]| DVec3::from_array(map[index].map(f64::from));
-    (vector(&buffer.position), vector(&buffer.normal))
 }
 
 #[test]
