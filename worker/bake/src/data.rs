@@ -6,7 +6,8 @@
 //! cannot be repaired: they are left out by a weight that starts one pixel inside the mask or silhouette.
 
 use ign_capture::{Background, Frame, ImportError, Scene, ViewImage};
-use ign_geometry::{Camera, GBuffer, Mesh, Similarity, select};
+use ign_geometry::select::Candidates;
+use ign_geometry::{Camera, Drawable, Mesh, Similarity};
 use ign_nets::color;
 use ign_render::{CoverageRule, ReferenceImage, RenderSettings, Target};
 use rayon::prelude::*;
@@ -28,6 +29,8 @@ const SELECTION_PX: u32 = 64;
 pub(crate) struct Dataset<'a> {
     pub(crate) scene: &'a Scene,
     pub(crate) mesh: Mesh,
+    /// `mesh`, ready to be drawn.
+    pub(crate) proxy: Drawable,
     pub(crate) normalisation: Similarity,
     pub(crate) frame: Frame,
     pub(crate) settings: RenderSettings,
@@ -110,9 +113,11 @@ impl<'a> Dataset<'a> {
                 Preset::Standard => ign_render::Recipe::Standard,
             },
         };
+        let mesh = scene.mesh.transformed(&normalisation);
         Ok(Self {
             scene,
-            mesh: scene.mesh.transformed(&normalisation),
+            proxy: Drawable::new(&mesh),
+            mesh,
             normalisation,
             frame,
             settings: render,
@@ -134,7 +139,7 @@ impl<'a> Dataset<'a> {
     pub(crate) fn scored(&self, view: usize) -> Result<Scored, BakeError> {
         let (camera, world) = self.cameras(view, 1);
         let image = self.scene.load_view(view, &world)?;
-        let target = Target::new(&self.mesh, &camera, &self.settings, self.device);
+        let target = Target::new(&self.proxy, &camera, &self.settings, self.device);
         let (h, w) = target.size();
         let pixels = (h * w) as usize;
         let silhouette = ign_nets::params::flat_values(&target.coverage);
@@ -185,7 +190,7 @@ impl<'a> Dataset<'a> {
             (Background::Black, Some(mask)) => unmultiplied(&image, mask),
             (_, Some(mask)) => inside_only(&image, mask),
             (_, None) => {
-                let silhouette = GBuffer::render(&self.mesh, &camera, 2).coverage;
+                let silhouette = self.proxy.g_buffer(&camera, 2).coverage;
                 inside_only(&image, &silhouette)
             }
         };
@@ -194,25 +199,16 @@ impl<'a> Dataset<'a> {
 
     /// Chooses the fixed reference views by coverage (paper, Sec. "Coverage-based View Selection").
     pub(crate) fn choose_references(&self, count: usize) -> Vec<usize> {
-        let views: Vec<GBuffer> = self
-            .train
-            .par_iter()
-            .map(|&view| {
-                let (camera, _) = self.cameras(view, 1);
-                let i = camera.intrinsics;
-                let scale = f64::from(SELECTION_PX) / f64::from(i.width.max(i.height));
-                let scaled = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
-                let small = Camera {
-                    intrinsics: i.resized(scaled(i.width), scaled(i.height)),
-                    camera_from_world: camera.camera_from_world,
-                };
-                GBuffer::render(&self.mesh, &small, 1)
-            })
-            .collect();
-        select::select_references(&views, count)
-            .into_iter()
-            .map(|at| self.train[at])
-            .collect()
+        let candidates = Candidates::new(self.train.len(), |at| {
+            let (camera, _) = self.cameras(self.train[at], 1);
+            let i = camera.intrinsics;
+            let scale = f64::from(SELECTION_PX) / f64::from(i.width.max(i.height));
+            let scaled = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
+            let small = camera.with_intrinsics(i.resized(scaled(i.width), scaled(i.height)));
+            self.proxy.g_buffer(&small, 1)
+        });
+        let chosen = candidates.choose(count);
+        chosen.into_iter().map(|at| self.train[at]).collect()
     }
 
     /// Loads the reference views as the bundle stores them: 8 bit, straight colour and weight.

@@ -64,7 +64,7 @@ fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
         .par_iter()
         .map(|&view| {
             let straight = data.straight(view, data.reference_scale)?;
-            let gbuffer = ign_geometry::GBuffer::render(&data.mesh, &straight.camera, 2);
+            let gbuffer = data.proxy.g_buffer(&straight.camera, 2);
             let usable: Vec<usize> = (0..gbuffer.mask.len())
                 .filter(|&at| gbuffer.coverage[at] >= 1.0 && straight.alpha[at] >= 0.99)
                 .collect();
@@ -353,8 +353,8 @@ pub(crate) fn train_paper(
         .iter()
         .map(|&view| {
             let straight = data.straight(view, 1)?;
-            let target = Target::new(&data.mesh, &straight.camera, &data.settings, data.device);
-            let gbuffer = ign_geometry::GBuffer::render(&data.mesh, &straight.camera, 1);
+            let target = Target::new(&data.proxy, &straight.camera, &data.settings, data.device);
+            let gbuffer = data.proxy.g_buffer(&straight.camera, 1);
             let covered = Tensor::from_slice(&gbuffer.mask).to_kind(Kind::Float);
             let mask = (covered
                 * Tensor::from_slice(&straight.alpha)

@@ -254,7 +254,7 @@ fn turntable(
         .enumerate()
         .map(|(at, camera)| {
             reporter.step(at as f64 / frames as f64, "rendering the turntable");
-            let target = Target::new(&data.mesh, camera, &data.settings, data.device);
+            let target = Target::new(&data.proxy, camera, &data.settings, data.device);
             to_image(&model.image(&target))
         })
         .collect()

@@ -103,7 +103,7 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
     let validation = load(&data.validation)?;
     let held_out = load(&data.held_out)?;
 
-    let references = References::new(&data.mesh, &images, data.settings.recipe, device);
+    let references = References::new(&data.proxy, &images, data.settings.recipe, device);
     let model = Model::new(references, data.settings.clone(), None, None);
     let bake = Bake {
         job,
@@ -210,7 +210,7 @@ impl Bake<'_> {
 
     /// A model without networks.
     fn plain(&self, recipe: ign_render::Recipe) -> Model {
-        let references = References::new(&self.data.mesh, self.images, recipe, self.data.device);
+        let references = References::new(&self.data.proxy, self.images, recipe, self.data.device);
         Model::new(
             references,
             RenderSettings {

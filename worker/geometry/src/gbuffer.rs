@@ -2,10 +2,15 @@
 //! "Network Inputs": position, normals, reflected viewing direction).
 
 use glam::{DVec2, DVec3};
-use rayon::prelude::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+use rayon::prelude::{
+    IndexedParallelIterator, IntoParallelIterator, IntoParallelRefMutIterator, ParallelIterator,
+};
 
-use crate::raster::{NO_TRIANGLE, Projected, key_triangle, nearest};
-use crate::{Camera, Mesh};
+use crate::raster::{DepthBuffer, NO_TRIANGLE, View, key_triangle};
+use crate::{Camera, Drawable, Mesh};
+
+/// Rows of normals by differences found by one task, at least.
+const ROWS_A_TASK: usize = 32;
 
 /// Maps of one view, row-major, `height * width` entries each. Outside `mask` everything else is zero.
 ///
@@ -38,101 +43,101 @@ pub struct GBuffer {
     pub triangle: Vec<u32>,
 }
 
-/// One pixel while it is drawn.
-#[derive(Clone, Copy, Default)]
-struct Pixel {
-    coverage: f32,
-    depth: f32,
-    position: [f32; 3],
-    normal: [f32; 3],
-    reflection: [f32; 3],
-    triangle: u32,
+/// Attributes of the surface seen at one point of the image.
+struct Attributes {
+    depth: f64,
+    position: DVec3,
+    normal: DVec3,
+    reflection: DVec3,
 }
 
 impl GBuffer {
-    /// Draws `mesh` with `samples` x `samples` samples a pixel (0 counts as 1).
+    /// Draws `mesh` with `samples` x `samples` samples a pixel. For several views of one mesh, make a [`Drawable`]
+    /// once; see [`Drawable::g_buffer`].
+    pub fn render(mesh: &Mesh, camera: &Camera, samples: u32) -> Self {
+        Drawable::new(mesh).g_buffer(camera, samples)
+    }
+}
+
+impl Drawable {
+    /// Draws the mesh with `samples` x `samples` samples a pixel (0 counts as 1).
     ///
     /// Coverage is the covered share of the samples. The attributes are those of the pixel's centre where the mesh
     /// covers it, so that a map is not shifted by a part of a pixel, and otherwise (in the silhouette's rim) those
     /// of the covered sample nearest to it.
-    pub fn render(mesh: &Mesh, camera: &Camera, samples: u32) -> Self {
-        let (width, height) = (
-            camera.intrinsics.width as usize,
-            camera.intrinsics.height as usize,
-        );
+    pub fn g_buffer(&self, camera: &Camera, samples: u32) -> GBuffer {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let samples = samples.max(1) as usize;
-        // With an odd number of samples one of them is the centre.
-        let grids: &[usize] = if samples % 2 == 1 {
-            &[samples]
-        } else {
-            &[samples, 1]
-        };
-        let scene = Projected::new(mesh, camera);
-        let bins = scene.bin(width, height, grids);
+        let view = View::new(self, camera, samples);
         let order = samples_by_distance(samples);
         let eye = camera.center();
-        let mut pixels = vec![Pixel::default(); width * height];
-        bins.bands(&mut pixels, width).for_each_init(
-            || (Vec::new(), Vec::new()),
-            |(keys, centers), (band, pixels)| {
-                nearest(&scene, &bins, band, samples, width, keys);
-                let top = bins.rows(band).start;
-                if grids.len() > 1 {
-                    nearest(&scene, &bins, band, 1, width, centers);
-                }
-                for (index, pixel) in pixels.iter_mut().enumerate() {
-                    let (row, column) = (index / width, index % width);
-                    let block = Block {
-                        keys,
-                        samples,
-                        row_samples: width * samples,
-                        row,
-                        column,
-                    };
-                    let count = block.count();
-                    if count == 0 {
-                        continue;
-                    }
-                    let center = centers.get(index).copied().and_then(key_triangle);
-                    let place = center.map(|triangle| (triangle, DVec2::splat(0.5)));
-                    let corner = DVec2::new(column as f64, (top + row) as f64);
-                    if let Some((triangle, offset)) = place.or_else(|| block.first(&order))
-                        && let Some(attributes) =
-                            attributes(mesh, &scene, triangle, corner + offset, eye)
-                    {
-                        let coverage = count as f32 / (samples * samples) as f32;
-                        *pixel = Pixel {
-                            coverage,
-                            ..attributes
-                        };
-                    }
-                }
-            },
-        );
-        let mask: Vec<bool> = pixels.iter().map(|pixel| pixel.coverage > 0.0).collect();
-        let normal_fd = normals_by_differences(&pixels, &mask, width, eye);
-        Self {
-            width: width as u32,
-            height: height as u32,
+        let pixels = width as usize * height as usize;
+        let mut maps = GBuffer {
+            width,
+            height,
             camera: *camera,
-            coverage: pixels.iter().map(|pixel| pixel.coverage).collect(),
-            depth: pixels.iter().map(|pixel| pixel.depth).collect(),
-            position: pixels.iter().map(|pixel| pixel.position).collect(),
-            normal: pixels.iter().map(|pixel| pixel.normal).collect(),
-            reflection: pixels.iter().map(|pixel| pixel.reflection).collect(),
-            triangle: pixels
-                .iter()
-                .map(|pixel| {
-                    if pixel.coverage > 0.0 {
-                        pixel.triangle
-                    } else {
-                        NO_TRIANGLE
+            coverage: vec![0.0; pixels],
+            mask: vec![false; pixels],
+            depth: vec![0.0; pixels],
+            position: vec![[0.0; 3]; pixels],
+            normal: vec![[0.0; 3]; pixels],
+            normal_fd: Vec::new(),
+            reflection: vec![[0.0; 3]; pixels],
+            triangle: vec![NO_TRIANGLE; pixels],
+        };
+        (
+            view.bands(&mut maps.coverage),
+            view.bands(&mut maps.mask),
+            view.bands(&mut maps.depth),
+            view.bands(&mut maps.position),
+            view.bands(&mut maps.normal),
+            view.bands(&mut maps.reflection),
+            view.bands(&mut maps.triangle),
+        )
+            .into_par_iter()
+            .enumerate()
+            .for_each_init(
+                || (DepthBuffer::default(), DepthBuffer::default()),
+                |(keys, centers), (band, maps)| {
+                    let (coverage, mask, depth, position, normal, reflection, triangle) = maps;
+                    view.draw(band, samples, keys);
+                    // With an odd number of samples one of them is the centre.
+                    if samples.is_multiple_of(2) {
+                        view.draw(band, 1, centers);
                     }
-                })
-                .collect(),
-            mask,
-            normal_fd,
-        }
+                    let top = view.rows(band).start;
+                    for index in 0..mask.len() {
+                        let (row, column) = (index / view.width, index % view.width);
+                        let block = Block {
+                            keys: &keys.keys,
+                            samples,
+                            row_samples: view.width * samples,
+                            row,
+                            column,
+                        };
+                        let count = block.count();
+                        if count == 0 {
+                            continue;
+                        }
+                        let center = centers.keys.get(index).copied().and_then(key_triangle);
+                        let place = center.map(|triangle| (triangle, DVec2::splat(0.5)));
+                        let corner = DVec2::new(column as f64, (top + row) as f64);
+                        if let Some((found, offset)) = place.or_else(|| block.first(&order))
+                            && let Some(seen) = attributes(&view, found, corner + offset, eye)
+                        {
+                            coverage[index] = count as f32 / (samples * samples) as f32;
+                            mask[index] = true;
+                            depth[index] = seen.depth as f32;
+                            position[index] = seen.position.as_vec3().to_array();
+                            normal[index] = seen.normal.as_vec3().to_array();
+                            reflection[index] = seen.reflection.as_vec3().to_array();
+                            triangle[index] = found;
+                        }
+                    }
+                },
+            );
+        maps.normal_fd = normals_by_differences(&maps, eye);
+        maps
     }
 }
 
@@ -184,16 +189,11 @@ fn samples_by_distance(samples: usize) -> Vec<(usize, usize)> {
 }
 
 /// Surface attributes where the ray through `px` meets `triangle`.
-fn attributes(
-    mesh: &Mesh,
-    scene: &Projected<'_>,
-    triangle: u32,
-    px: DVec2,
-    eye: DVec3,
-) -> Option<Pixel> {
-    let (weights, depth) = scene.surface(triangle, px)?;
-    let corners = mesh.triangles[triangle as usize].map(|corner| corner as usize);
-    let [a, b, c] = corners.map(|corner| mesh.positions[corner]);
+#[inline]
+fn attributes(view: &View<'_>, triangle: u32, px: DVec2, eye: DVec3) -> Option<Attributes> {
+    let surface = view.surface(triangle, px)?;
+    let weights = surface.weights;
+    let [a, b, c] = surface.positions;
     let position = a * weights[0] + b * weights[1] + c * weights[2];
     if !position.as_vec3().is_finite() {
         return None;
@@ -203,11 +203,11 @@ fn attributes(
     let face = if face.dot(view) > 0.0 { -face } else { face };
     // The side is the face's, at each corner by itself: a vertex of triangles with mixed winding points anywhere, and an
     // interpolated normal alone would flip in the middle of a silhouette's triangle.
-    let normal = corners
+    let normal = surface
+        .normals
         .iter()
         .zip(weights)
-        .map(|(corner, weight)| {
-            let normal = mesh.normals.get(*corner).copied().unwrap_or_default();
+        .map(|(normal, weight)| {
             let side = if normal.dot(face) < 0.0 { -1.0 } else { 1.0 };
             normal * side * weight
         })
@@ -215,14 +215,11 @@ fn attributes(
     let normal = facing(normal, view)
         .or_else(|| facing(face, view))
         .unwrap_or(-view);
-    let reflection = view - normal * (2.0 * view.dot(normal));
-    Some(Pixel {
-        coverage: 0.0,
-        depth: depth as f32,
-        position: position.as_vec3().to_array(),
-        normal: normal.as_vec3().to_array(),
-        reflection: reflection.as_vec3().to_array(),
-        triangle,
+    Some(Attributes {
+        depth: surface.depth,
+        position,
+        normal,
+        reflection: view - normal * (2.0 * view.dot(normal)),
     })
 }
 
@@ -238,20 +235,17 @@ fn facing(normal: DVec3, view: DVec3) -> Option<DVec3> {
 }
 
 /// Normals from differences of neighbouring positions: central where both neighbours are covered, else one-sided.
-fn normals_by_differences(
-    pixels: &[Pixel],
-    mask: &[bool],
-    width: usize,
-    eye: DVec3,
-) -> Vec<[f32; 3]> {
-    let mut normals = vec![[0.0_f32; 3]; pixels.len()];
-    let position = |index: usize| glam::Vec3::from(pixels[index].position).as_dvec3();
+fn normals_by_differences(maps: &GBuffer, eye: DVec3) -> Vec<[f32; 3]> {
+    let (width, mask) = (maps.width as usize, &maps.mask);
+    let mut normals = vec![[0.0_f32; 3]; mask.len()];
+    let position = |index: usize| glam::Vec3::from(maps.position[index]).as_dvec3();
     let covered = |index: Option<usize>| {
         index.filter(|index| mask.get(*index).is_some_and(|covered| *covered))
     };
     normals
         .par_iter_mut()
         .enumerate()
+        .with_min_len(width.max(1) * ROWS_A_TASK)
         .filter(|(index, _)| mask[*index])
         .for_each(|(index, normal)| {
             let column = index % width;
@@ -275,7 +269,7 @@ fn normals_by_differences(
                 vector
             };
             *normal = facing(vector, view)
-                .map_or(pixels[index].normal, |normal| normal.as_vec3().to_array());
+                .map_or(maps.normal[index], |normal| normal.as_vec3().to_array());
         });
     normals
 }

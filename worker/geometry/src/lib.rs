@@ -9,6 +9,7 @@
 
 mod camera;
 mod coverage;
+mod drawable;
 mod formats;
 mod gbuffer;
 mod mesh;
@@ -18,6 +19,7 @@ mod warp;
 
 pub use camera::{Camera, CameraError, CameraIntrinsics, Projection, Similarity};
 pub use coverage::coverage_map;
+pub use drawable::Drawable;
 pub use formats::read_mesh;
 pub use gbuffer::GBuffer;
 pub use mesh::{Mesh, MeshError};

@@ -1,42 +1,51 @@
 //! The rasteriser: which triangle is nearest at each sample of the image plane, and how deep it lies.
 //!
-//! How it works: vertices are projected once; triangles that cross the near plane are clipped; each triangle is put
-//! into the bins of the bands of pixel rows it touches; bands are drawn in parallel with f64 edge functions.
+//! How it works: the boxes around the mesh's clusters ([`Drawable`]) are projected and sorted into bands of pixel rows,
+//! which are drawn in parallel. A band takes its clusters front to back, leaves out those that lie wholly behind what
+//! it has drawn, projects the vertices of the others, clips triangles that cross the near plane, drops those that no
+//! sample can meet, and tests the rest with f64 edge functions.
 //!
 //! Invariants:
 //! - *Watertight.* The edge function of an edge is computed from the same end points in the same order whichever
 //!   triangle asks, so two triangles that share an edge get exactly opposite values, and a sample exactly on it
-//!   belongs to one of them (top-left rule).
-//! - *Deterministic.* The nearest surface wins, ties go to the lower triangle index; neither threads nor the order of
-//!   drawing matter.
+//!   belongs to one of them (top-left rule). Copies of a vertex are projected to the same bits.
+//! - *Deterministic.* The nearest surface wins, ties go to the lower triangle index; neither threads, nor the order of
+//!   drawing, nor what was left out matter: a cluster is hidden only if every sample it could meet already holds a
+//!   strictly nearer surface.
 //! - Both sides of a triangle are drawn: proxies of real captures are open and their winding is not reliable.
 //! - Whatever is not finite, also as the f32 that maps are made of, is not drawn.
 
 use std::ops::Range;
 
 use glam::{DVec2, DVec3};
-use rayon::prelude::{IndexedParallelIterator, ParallelIterator, ParallelSlice, ParallelSliceMut};
+use rayon::prelude::{
+    IndexedParallelIterator, IntoParallelIterator, IntoParallelRefIterator, ParallelIterator,
+    ParallelSliceMut,
+};
 
-use crate::{Camera, Mesh};
+use crate::drawable::{Bounds, Cluster, VERTICES};
+use crate::{Camera, Drawable, Mesh};
 
 /// Marks a sample that no triangle covers in [`Raster::triangle`].
 pub const NO_TRIANGLE: u32 = u32::MAX;
 
-/// Near plane as a fraction of the deepest vertex's depth: far enough from zero that f64 screen coordinates keep
-/// their precision, near enough that nothing a camera can see is lost.
+/// Near plane as a fraction of the depth of the scene's bounding box: far enough from zero that f64 screen coordinates
+/// keep their precision, near enough that nothing a camera can see is lost.
 const NEAR_FRACTION: f64 = 1e-9;
 /// Samples drawn by one task: its key buffer (8 bytes a sample) then stays in the second-level cache.
 const BAND_SAMPLES: usize = 1 << 16;
 /// At least this many bands, where there are that many rows, so that small images are drawn in parallel too.
 const MIN_BANDS: usize = 8;
-/// Triangles binned by one task.
-const BIN_CHUNK: usize = 1 << 15;
 /// Up to this many samples a row are tested one by one; wider rows have their ends computed.
 const NARROW: usize = 8;
 /// Slack, in samples, when the samples inside a bounding box are found; the edge functions decide.
 const BOX_SLACK: f64 = 1e-6;
+/// Samples across a tile, and down: the grain at which hidden clusters are found.
+const TILE: usize = 8;
+/// Relative slack of projected boxes, far above what rounding moves a vertex and far below a pixel.
+const BOUNDS_SLACK: f64 = 1e-12;
 
-/// What [`rasterize`] found at each pixel centre, row-major.
+/// What [`Drawable::rasterize`] found at each pixel centre, row-major.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Raster {
     /// Width in pixels.
@@ -49,36 +58,43 @@ pub struct Raster {
     pub triangle: Vec<u32>,
 }
 
-/// Draws the mesh at the pixel centres of the camera's image.
-///
-/// A camera or mesh put together by hand from values that are not finite draws nothing there.
+/// Draws the mesh at the pixel centres of the camera's image. For several views of one mesh, make a [`Drawable`] once.
 pub fn rasterize(mesh: &Mesh, camera: &Camera) -> Raster {
-    let (width, height) = (
-        camera.intrinsics.width as usize,
-        camera.intrinsics.height as usize,
-    );
-    let scene = Projected::new(mesh, camera);
-    let bins = scene.bin(width, height, &[1]);
-    let mut pixels = vec![(0.0_f32, NO_TRIANGLE); width * height];
-    bins.bands(&mut pixels, width)
-        .for_each_init(Vec::new, |keys, (band, pixels)| {
-            let rows = bins.rows(band);
-            nearest(&scene, &bins, band, 1, width, keys);
-            for (index, (pixel, key)) in pixels.iter_mut().zip(keys.iter()).enumerate() {
-                let place = DVec2::new((index % width) as f64, (rows.start + index / width) as f64);
-                if let Some(triangle) = key_triangle(*key)
-                    && let Some((_, depth)) = scene.surface(triangle, place + 0.5)
-                {
-                    *pixel = (depth as f32, triangle);
+    Drawable::new(mesh).rasterize(camera)
+}
+
+impl Drawable {
+    /// Draws the mesh at the pixel centres of the camera's image.
+    ///
+    /// A camera or mesh put together by hand from values that are not finite draws nothing there.
+    pub fn rasterize(&self, camera: &Camera) -> Raster {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        let pixels = width as usize * height as usize;
+        let (mut depth, mut triangle) = (vec![0.0_f32; pixels], vec![NO_TRIANGLE; pixels]);
+        let view = View::new(self, camera, 1);
+        (view.bands(&mut depth), view.bands(&mut triangle))
+            .into_par_iter()
+            .enumerate()
+            .for_each_init(DepthBuffer::default, |keys, (band, (depth, triangle))| {
+                view.draw(band, 1, keys);
+                let top = view.rows(band).start;
+                for (index, key) in keys.keys.iter().enumerate() {
+                    let (column, row) = (index % view.width, top + index / view.width);
+                    let place = DVec2::new(column as f64, row as f64) + 0.5;
+                    if let Some(found) = key_triangle(*key)
+                        && let Some(surface) = view.surface(found, place)
+                    {
+                        depth[index] = surface.depth as f32;
+                        triangle[index] = found;
+                    }
                 }
-            }
-        });
-    let (depth, triangle) = pixels.into_iter().unzip();
-    Raster {
-        width: width as u32,
-        height: height as u32,
-        depth,
-        triangle,
+            });
+        Raster {
+            width,
+            height,
+            depth,
+            triangle,
+        }
     }
 }
 
@@ -115,38 +131,93 @@ fn weights([a, b, c]: [DVec3; 3], ray: DVec3) -> Option<[f64; 3]> {
         .then(|| clamped.map(|weight| weight / sum))
 }
 
-/// Fills `keys` with the nearest triangle at each sample of a band; samples lie row-major, `width * samples` a row.
-pub(crate) fn nearest(
-    scene: &Projected<'_>,
-    bins: &Bins,
-    band: usize,
-    samples: usize,
-    width: usize,
-    keys: &mut Vec<u64>,
-) {
-    let rows = bins.rows(band);
-    let row_samples = width * samples;
-    keys.clear();
-    keys.resize(rows.len() * samples * row_samples, u64::MAX);
-    bins.for_each_triangle(band, |triangle| {
-        scene.scan(
-            triangle,
-            samples,
-            width,
-            &rows,
-            |row, column, inverse_depth| {
-                let key = &mut keys[(row - rows.start * samples) * row_samples + column];
-                keep_nearest(key, inverse_depth, triangle);
-            },
-        );
-    });
+/// Where the ray through an image point meets a triangle.
+pub(crate) struct Surface {
+    /// Weights of the triangle's corners.
+    pub(crate) weights: [f64; 3],
+    /// Camera z.
+    pub(crate) depth: f64,
+    /// The corners in world axes.
+    pub(crate) positions: [DVec3; 3],
+    /// The corners' normals.
+    pub(crate) normals: [DVec3; 3],
 }
 
-/// Depth test. A key orders by nearness (bits of a positive float order like the float), then by triangle index.
+/// The nearest triangle at each sample of a band.
+#[derive(Default)]
+pub(crate) struct DepthBuffer {
+    /// Row-major, `width` a row. A key orders by nearness, then by triangle index; see [`key`].
+    pub(crate) keys: Vec<u64>,
+    width: usize,
+    /// The farthest surface of each tile of `TILE` x `TILE` samples, as [`farness`]. May be out of date: too far.
+    farthest: Vec<u32>,
+    /// Whether a tile has been drawn to since `farthest` was found.
+    drawn_to: Vec<bool>,
+}
+
+impl DepthBuffer {
+    fn clear(&mut self, width: usize, height: usize) {
+        let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
+        self.width = width;
+        self.keys.clear();
+        self.keys.resize(width * height, u64::MAX);
+        self.farthest.clear();
+        self.farthest.resize(tiles, u32::MAX);
+        self.drawn_to.clear();
+        self.drawn_to.resize(tiles, false);
+    }
+
+    /// Whether every sample in `columns` and `rows` holds something strictly nearer than `nearest`, a [`farness`].
+    fn hide(&mut self, columns: &Range<usize>, rows: &Range<usize>, nearest: u32) -> bool {
+        for row in tiles(rows) {
+            for column in tiles(columns) {
+                let tile = row * self.width.div_ceil(TILE) + column;
+                if nearest > self.farthest[tile] {
+                    continue;
+                }
+                if !self.drawn_to[tile] {
+                    return false;
+                }
+                self.drawn_to[tile] = false;
+                let columns = column * TILE..((column + 1) * TILE).min(self.width);
+                let lines = self.keys[row * TILE * self.width..].chunks(self.width);
+                let far = lines
+                    .take(TILE)
+                    .flat_map(|line| &line[columns.clone()])
+                    .max();
+                self.farthest[tile] = far.map_or(u32::MAX, |key| (key >> 32) as u32);
+                if nearest <= self.farthest[tile] {
+                    return false;
+                }
+            }
+        }
+        true
+    }
+
+    fn mark(&mut self, columns: &Range<usize>, rows: &Range<usize>) {
+        for row in tiles(rows) {
+            let first = row * self.width.div_ceil(TILE);
+            let columns = tiles(columns);
+            self.drawn_to[first + columns.start..first + columns.end].fill(true);
+        }
+    }
+}
+
+/// The tiles that hold a range of samples.
+fn tiles(samples: &Range<usize>) -> Range<usize> {
+    samples.start / TILE..samples.end.div_ceil(TILE)
+}
+
+/// Orders positive inverse depths from near to far: bits of a positive float order like the float.
 #[inline]
-fn keep_nearest(key: &mut u64, inverse_depth: f64, triangle: u32) {
-    let candidate = (u64::from(!(inverse_depth as f32).to_bits()) << 32) | u64::from(triangle);
-    *key = candidate.min(*key);
+fn farness(inverse_depth: f64) -> u32 {
+    !(inverse_depth as f32).to_bits()
+}
+
+/// What a sample keeps the smallest of.
+#[inline]
+fn key(inverse_depth: f64, triangle: u32) -> u64 {
+    (u64::from(farness(inverse_depth)) << 32) | u64::from(triangle)
 }
 
 /// The triangle of a key, if any was drawn.
@@ -155,8 +226,8 @@ pub(crate) fn key_triangle(key: u64) -> Option<u32> {
     (key != u64::MAX).then_some(key as u32)
 }
 
-/// A vertex on the screen, in pixels.
-#[derive(Clone, Copy)]
+/// A vertex on the screen, in samples.
+#[derive(Clone, Copy, Default)]
 struct ScreenPoint {
     x: f64,
     y: f64,
@@ -164,56 +235,245 @@ struct ScreenPoint {
     inverse_depth: f64,
 }
 
-/// A mesh seen by a camera.
-pub(crate) struct Projected<'a> {
-    mesh: &'a Mesh,
-    camera: &'a Camera,
-    /// Vertices in camera axes.
-    points: Vec<DVec3>,
-    screen: Vec<ScreenPoint>,
-    near: f64,
+/// The samples that a box may hold: columns and rows from the first to before the last, both within the band.
+#[derive(Clone, Copy, Default)]
+struct SampleBox {
+    columns: (u32, u32),
+    rows: (u32, u32),
 }
 
-impl<'a> Projected<'a> {
-    pub(crate) fn new(mesh: &'a Mesh, camera: &'a Camera) -> Self {
-        let points: Vec<DVec3> = mesh
-            .positions
-            .iter()
-            .map(|position| camera.camera_from_world.transform_point3(*position))
-            .collect();
-        let deepest = points
-            .iter()
-            .map(|point| point.z)
-            .filter(|z| z.is_finite())
-            .fold(0.0, f64::max);
-        let near = (deepest * NEAR_FRACTION).max(f64::MIN_POSITIVE);
-        let mut scene = Self {
-            mesh,
-            camera,
-            points,
-            screen: Vec::new(),
-            near,
+/// The samples of a band, on a grid of `samples` x `samples` samples a pixel.
+struct Grid {
+    samples: f64,
+    columns: u32,
+    rows: Range<u32>,
+}
+
+impl Grid {
+    /// The samples that a point's box holds: none, or one where rounding could decide.
+    ///
+    /// Sample i lies at i + 0.5: it is at or above `low` from ceil(low - 0.5) on, at or below `high` up to
+    /// floor(high - 0.5). A cast cuts off like floor, and sends what is too small (or NaN) to 0; both are many times
+    /// cheaper than the library's rounding.
+    #[inline]
+    fn around(&self, point: &ScreenPoint) -> SampleBox {
+        let range = |at: f64, low: u32, high: u32| {
+            (
+                upper(at + (0.5 - BOX_SLACK), f64::from(low)) as u32,
+                lower(at + (0.5 + BOX_SLACK), f64::from(high)) as u32,
+            )
         };
-        scene.screen = scene
-            .points
-            .iter()
-            .map(|point| scene.screen_point(*point))
-            .collect();
-        scene
+        SampleBox {
+            columns: range(point.x, 0, self.columns),
+            rows: range(point.y, self.rows.start, self.rows.end),
+        }
+    }
+}
+
+impl SampleBox {
+    /// The samples that a triangle's bounding box may hold. May hold a few that the triangle does not cover: the edge
+    /// functions decide.
+    #[inline]
+    fn join([a, b, c]: [Self; 3]) -> Self {
+        let both = |a: (u32, u32), b: (u32, u32)| (a.0.min(b.0), a.1.max(b.1));
+        Self {
+            columns: both(both(a.columns, b.columns), c.columns),
+            rows: both(both(a.rows, b.rows), c.rows),
+        }
     }
 
-    fn screen_point(&self, point: DVec3) -> ScreenPoint {
-        let intrinsics = &self.camera.intrinsics;
-        if point.is_finite() && point.z < self.near {
-            return ScreenPoint {
-                x: 0.0,
-                y: 0.0,
-                inverse_depth: 0.0,
-            };
+    #[inline]
+    fn is_empty(&self) -> bool {
+        self.columns.0 >= self.columns.1 || self.rows.0 >= self.rows.1
+    }
+}
+
+/// A cluster's vertices on the screen.
+struct Projected {
+    points: [ScreenPoint; VERTICES],
+    boxes: [SampleBox; VERTICES],
+}
+
+/// A cluster as a band sees it, in pixels.
+struct Visible {
+    /// [`farness`] of the nearest corner of its box; 0 where that is not known.
+    nearest: u32,
+    cluster: u32,
+    columns: Range<u32>,
+    rows: Range<u32>,
+}
+
+/// A mesh seen by a camera.
+pub(crate) struct View<'a> {
+    drawable: &'a Drawable,
+    camera: &'a Camera,
+    near: f64,
+    /// Width in pixels.
+    pub(crate) width: usize,
+    height: usize,
+    band_rows: usize,
+    /// The clusters of each band, front to back.
+    bands: Vec<Vec<(u32, u32)>>,
+    visible: Vec<Visible>,
+}
+
+impl<'a> View<'a> {
+    /// Finds what of `drawable` the camera sees. `finest` is the largest number of samples a pixel side that will be
+    /// drawn.
+    pub(crate) fn new(drawable: &'a Drawable, camera: &'a Camera, finest: usize) -> Self {
+        let intrinsics = &camera.intrinsics;
+        let (width, height) = (intrinsics.width as usize, intrinsics.height as usize);
+        let by_memory = BAND_SAMPLES / (width * finest * finest).max(1);
+        let band_rows = by_memory.min(height.div_ceil(MIN_BANDS)).max(1);
+        let (middle, half) = in_camera(drawable.bounds(), camera);
+        let deepest = Some(middle.z + half.z).filter(|z| z.is_finite());
+        let near = (deepest.unwrap_or(0.0) * NEAR_FRACTION).max(f64::MIN_POSITIVE);
+        let visible: Vec<Visible> = drawable
+            .clusters()
+            .par_iter()
+            .enumerate()
+            .with_min_len(1024)
+            .filter_map(|(index, cluster)| visible(index, cluster, camera, near))
+            .collect();
+        let mut bands = vec![Vec::new(); height.div_ceil(band_rows)];
+        for (index, cluster) in visible.iter().enumerate() {
+            let first = cluster.rows.start as usize / band_rows;
+            let end = (cluster.rows.end as usize).div_ceil(band_rows);
+            for band in &mut bands[first..end] {
+                band.push((cluster.nearest, index as u32));
+            }
         }
+        Self {
+            drawable,
+            camera,
+            near,
+            width,
+            height,
+            band_rows,
+            bands,
+            visible,
+        }
+    }
+
+    /// Pixel rows of a band.
+    pub(crate) fn rows(&self, band: usize) -> Range<usize> {
+        band * self.band_rows..((band + 1) * self.band_rows).min(self.height)
+    }
+
+    /// Splits an image with one item a pixel into the bands.
+    pub(crate) fn bands<'b, T: Send>(&self, image: &'b mut [T]) -> rayon::slice::ChunksMut<'b, T> {
+        image.par_chunks_mut((self.width * self.band_rows).max(1))
+    }
+
+    /// Fills `keys` with the nearest triangle at each sample of a band, `samples` x `samples` a pixel; samples lie
+    /// row-major, `width * samples` a row.
+    pub(crate) fn draw(&self, band: usize, samples: usize, keys: &mut DepthBuffer) {
+        let rows = self.rows(band);
+        let (top, across) = (rows.start * samples, self.width * samples);
+        keys.clear(across, rows.len() * samples);
+        let grid = Grid {
+            samples: samples as f64,
+            columns: across as u32,
+            rows: top as u32..(rows.end * samples) as u32,
+        };
+        let mut order = self.bands[band].clone();
+        order.sort_unstable();
+        let mut projected = Projected {
+            points: [ScreenPoint::default(); VERTICES],
+            boxes: [SampleBox::default(); VERTICES],
+        };
+        for (nearest, index) in order {
+            let visible = &self.visible[index as usize];
+            let columns = &visible.columns;
+            let columns = columns.start as usize * samples..columns.end as usize * samples;
+            let first = (visible.rows.start as usize).max(rows.start) - rows.start;
+            let end = (visible.rows.end as usize).min(rows.end) - rows.start;
+            let lines = first * samples..end * samples;
+            if keys.hide(&columns, &lines, nearest) {
+                continue;
+            }
+            let cluster = &self.drawable.clusters()[visible.cluster as usize];
+            self.scan(
+                cluster,
+                &grid,
+                &mut projected,
+                |row, column, inverse_depth, triangle| {
+                    let kept = &mut keys.keys[(row - top) * across + column];
+                    *kept = key(inverse_depth, triangle).min(*kept);
+                },
+            );
+            keys.mark(&columns, &lines);
+        }
+    }
+
+    /// Where the ray through `px` meets a triangle that was drawn; `None` when that is seen edge-on, up to rounding, or
+    /// so far or near that f32 cannot hold its depth.
+    #[inline]
+    pub(crate) fn surface(&self, triangle: u32, px: DVec2) -> Option<Surface> {
+        let (positions, normals) = self.drawable.corners(triangle);
+        let points = positions.map(|position| self.point(position));
+        let weights = weights(points, self.camera.intrinsics.ray(px))?;
+        let depths = weights.iter().zip(&points);
+        let depth: f64 = depths.map(|(weight, point)| weight * point.z).sum();
+        (depth as f32 > 0.0 && (depth as f32).is_finite()).then_some(Surface {
+            weights,
+            depth,
+            positions,
+            normals,
+        })
+    }
+
+    /// Calls `put(row, column, 1/depth, triangle)` for each sample of the grid that a triangle of a cluster covers.
+    #[inline]
+    fn scan(
+        &self,
+        cluster: &Cluster,
+        grid: &Grid,
+        projected: &mut Projected,
+        mut put: impl FnMut(usize, usize, f64, u32),
+    ) {
+        let mut all_in_front = true;
+        let places = projected.points.iter_mut().zip(&mut projected.boxes);
+        for (position, (point, samples)) in cluster.positions.iter().zip(places) {
+            *point = self.screen_point(self.point(*position), grid.samples);
+            *samples = grid.around(point);
+            all_in_front &= point.inverse_depth > 0.0;
+        }
+        for (triangle, corners) in cluster.triangles.iter().zip(&cluster.corners) {
+            let corners = corners.map(usize::from);
+            let screen = || corners.map(|corner| projected.points[corner]);
+            let mut put = |row, column, inverse_depth| put(row, column, inverse_depth, *triangle);
+            if all_in_front || screen().iter().all(|point| point.inverse_depth > 0.0) {
+                let samples = SampleBox::join(corners.map(|corner| projected.boxes[corner]));
+                if !samples.is_empty() {
+                    scan(&screen(), &samples, &mut put);
+                }
+            } else if !screen().iter().any(|point| point.inverse_depth.is_nan()) {
+                let points = corners.map(|corner| self.point(cluster.positions[corner]));
+                for screen in self.clipped(points, &screen(), grid).iter().flatten() {
+                    let samples = SampleBox::join(screen.each_ref().map(|p| grid.around(p)));
+                    if !samples.is_empty() {
+                        scan(screen, &samples, &mut put);
+                    }
+                }
+            }
+        }
+    }
+
+    #[inline]
+    fn point(&self, position: DVec3) -> DVec3 {
+        self.camera.camera_from_world.transform_point3(position)
+    }
+
+    #[inline]
+    fn screen_point(&self, point: DVec3, samples: f64) -> ScreenPoint {
+        if point.is_finite() && point.z < self.near {
+            return ScreenPoint::default();
+        }
+        let intrinsics = &self.camera.intrinsics;
         let inverse_depth = point.z.recip();
-        let x = intrinsics.fx * point.x * inverse_depth + intrinsics.cx;
-        let y = intrinsics.fy * point.y * inverse_depth + intrinsics.cy;
+        let x = (intrinsics.fx * point.x * inverse_depth + intrinsics.cx) * samples;
+        let y = (intrinsics.fy * point.y * inverse_depth + intrinsics.cy) * samples;
         let finite = x.is_finite() && y.is_finite() && inverse_depth.is_finite();
         ScreenPoint {
             x,
@@ -222,74 +482,28 @@ impl<'a> Projected<'a> {
         }
     }
 
-    /// Corner weights and depth where the ray through `px` meets a triangle; `None` when it is seen edge-on, up to
-    /// rounding, or so far or near that f32 cannot hold its depth.
-    pub(crate) fn surface(&self, triangle: u32, px: DVec2) -> Option<([f64; 3], f64)> {
-        let points =
-            self.mesh.triangles[triangle as usize].map(|corner| self.points[corner as usize]);
-        let weights = weights(points, self.camera.intrinsics.ray(px))?;
-        let depth: f64 = weights
-            .iter()
-            .zip(&points)
-            .map(|(weight, point)| weight * point.z)
-            .sum();
-        (depth as f32 > 0.0 && (depth as f32).is_finite()).then_some((weights, depth))
-    }
-
-    /// Calls `put(row, column, 1/depth)` for each sample that a triangle covers, within the pixel rows `rows` of an
-    /// image `width` pixels wide, on a grid of `samples` x `samples` samples a pixel; rows and columns are those of
-    /// samples.
-    #[inline]
-    pub(crate) fn scan(
-        &self,
-        triangle: u32,
-        samples: usize,
-        width: usize,
-        rows: &Range<usize>,
-        mut put: impl FnMut(usize, usize, f64),
-    ) {
-        self.for_each_screen_triangle(triangle, |screen| {
-            scan(screen, samples, width, rows, &mut put);
-        });
-    }
-
-    /// Calls `each` with what of a triangle lies in front of the near plane, as triangles on the screen.
-    #[inline]
-    fn for_each_screen_triangle(&self, triangle: u32, mut each: impl FnMut(&[ScreenPoint; 3])) {
-        let Some(corners) = self.existing(self.mesh.triangles[triangle as usize]) else {
-            return;
-        };
-        let screen = corners.map(|corner| self.screen[corner]);
-        if screen.iter().all(|point| point.inverse_depth > 0.0) {
-            each(&screen);
-        } else if !screen.iter().any(|point| point.inverse_depth.is_nan()) {
-            self.clipped(corners).iter().flatten().for_each(each);
-        }
-    }
-
-    fn existing(&self, corners: [u32; 3]) -> Option<[usize; 3]> {
-        let corners = corners.map(|corner| corner as usize);
-        corners
-            .iter()
-            .all(|corner| *corner < self.screen.len())
-            .then_some(corners)
-    }
-
     /// Sutherland-Hodgman against the near plane: up to four corners, as a fan.
     #[cold]
-    fn clipped(&self, corners: [usize; 3]) -> [Option<[ScreenPoint; 3]>; 2] {
+    fn clipped(
+        &self,
+        points: [DVec3; 3],
+        screen: &[ScreenPoint; 3],
+        grid: &Grid,
+    ) -> [Option<[ScreenPoint; 3]>; 2] {
         let mut polygon = Vec::with_capacity(4);
-        for (index, &corner) in corners.iter().enumerate() {
-            let next = corners[(index + 1) % 3];
-            let (here, there) = (self.screen[corner], self.screen[next]);
+        for index in 0..3 {
+            let next = (index + 1) % 3;
+            let (here, there) = (screen[index], screen[next]);
             if here.inverse_depth > 0.0 {
                 polygon.push(here);
             }
             if (here.inverse_depth > 0.0) != (there.inverse_depth > 0.0) {
-                // Both triangles of an edge must compute the same crossing: always start from the lower index.
-                let (from, to) = (self.points[corner.min(next)], self.points[corner.max(next)]);
+                // Both triangles of an edge must compute the same crossing: always start from the end in front.
+                let front = here.inverse_depth > 0.0;
+                let (from, to) = if front { (index, next) } else { (next, index) };
+                let (from, to) = (points[from], points[to]);
                 let crossing = from.lerp(to, (self.near - from.z) / (to.z - from.z));
-                polygon.push(self.screen_point(crossing.with_z(self.near)));
+                polygon.push(self.screen_point(crossing.with_z(self.near), grid.samples));
             }
         }
         if polygon.iter().any(|point| point.inverse_depth.is_nan()) {
@@ -301,114 +515,65 @@ impl<'a> Projected<'a> {
             _ => [None, None],
         }
     }
-
-    /// Sorts the triangles into bands of pixel rows. `grids` are the sample grids that will be drawn (samples per
-    /// pixel side); a triangle that meets no sample of any of them is left out.
-    pub(crate) fn bin(&self, width: usize, height: usize, grids: &[usize]) -> Bins {
-        let finest = grids.iter().copied().max().unwrap_or(1);
-        let by_memory = BAND_SAMPLES / (width * finest * finest).max(1);
-        let band_rows = by_memory.min(height.div_ceil(MIN_BANDS)).max(1);
-        let bands = height.div_ceil(band_rows);
-        let count = self.mesh.triangles.len().min(NO_TRIANGLE as usize);
-        let chunks = self.mesh.triangles[..count]
-            .par_chunks(BIN_CHUNK)
-            .enumerate()
-            .map(|(chunk, triangles)| {
-                let mut bins = vec![Vec::new(); bands];
-                for index in 0..triangles.len() {
-                    let triangle = (chunk * BIN_CHUNK + index) as u32;
-                    let mut touched = 0..0;
-                    self.for_each_screen_triangle(triangle, |screen| {
-                        for &samples in grids {
-                            let (columns, rows) = sample_box(screen, samples, width, &(0..height));
-                            if columns.is_empty() || rows.is_empty() {
-                                continue;
-                            }
-                            let first = rows.start / (samples * band_rows);
-                            let last = (rows.end - 1) / (samples * band_rows) + 1;
-                            touched = if touched.is_empty() {
-                                first..last
-                            } else {
-                                first.min(touched.start)..last.max(touched.end)
-                            };
-                        }
-                    });
-                    for bin in &mut bins[touched] {
-                        bin.push(triangle);
-                    }
-                }
-                bins
-            })
-            .collect();
-        Bins {
-            band_rows,
-            height,
-            chunks,
-        }
-    }
 }
 
-/// Triangles of each band, in rising order.
-pub(crate) struct Bins {
-    band_rows: usize,
-    height: usize,
-    /// `chunks[chunk][band]`.
-    chunks: Vec<Vec<Vec<u32>>>,
-}
-
-impl Bins {
-    /// Pixel rows of a band.
-    pub(crate) fn rows(&self, band: usize) -> Range<usize> {
-        band * self.band_rows..((band + 1) * self.band_rows).min(self.height)
-    }
-
-    pub(crate) fn for_each_triangle(&self, band: usize, mut each: impl FnMut(u32)) {
-        for chunk in &self.chunks {
-            chunk[band].iter().for_each(|triangle| each(*triangle));
-        }
-    }
-
-    /// Splits an image with `row_items` items a pixel row into its bands.
-    pub(crate) fn bands<'a, T: Send>(
-        &self,
-        image: &'a mut [T],
-        row_items: usize,
-    ) -> impl IndexedParallelIterator<Item = (usize, &'a mut [T])> {
-        image
-            .par_chunks_mut((row_items * self.band_rows).max(1))
-            .enumerate()
-    }
-}
-
-/// Columns and rows of the samples that a triangle's bounding box may hold, within the image and the pixel rows
-/// `rows`. May hold a few that the triangle does not cover: the edge functions decide.
-fn sample_box(
-    [a, b, c]: &[ScreenPoint; 3],
-    samples: usize,
-    width: usize,
-    rows: &Range<usize>,
-) -> (Range<usize>, Range<usize>) {
-    let scale = samples as f64;
-    // Sample i lies at i + 0.5: it is at or above `low` from ceil(low - 0.5) on, at or below `high` up to
-    // floor(high - 0.5). A cast cuts off like floor, and sends what is too small (or NaN) to 0; both are many times
-    // cheaper than the library's rounding.
-    let range = |low: f64, high: f64, limits: Range<usize>| {
-        let first = upper(low * scale + (0.5 - BOX_SLACK), limits.start as f64) as usize;
-        let end = lower(high * scale + (0.5 + BOX_SLACK), limits.end as f64) as usize;
-        first..end
-    };
+/// Middle and half the size, along the camera's axes, of a box around a box; wide enough for every rounding.
+fn in_camera(bounds: Bounds, camera: &Camera) -> (DVec3, DVec3) {
+    let pose = &camera.camera_from_world;
+    let size = pose.matrix3.abs();
+    let (middle, half) = (
+        bounds.low * 0.5 + bounds.high * 0.5,
+        bounds.high * 0.5 - bounds.low * 0.5,
+    );
+    let magnitude = size * (middle.abs() + half) + pose.translation.abs();
     (
-        range(
-            lower(lower(a.x, b.x), c.x),
-            upper(upper(a.x, b.x), c.x),
-            0..width * samples,
-        ),
-        range(
-            lower(lower(a.y, b.y), c.y),
-            upper(upper(a.y, b.y), c.y),
-            rows.start * samples..rows.end * samples,
-        ),
+        pose.transform_point3(middle),
+        size * half + magnitude * BOUNDS_SLACK,
     )
+}
+
+/// Where a cluster falls in the camera's image; `None` where that is certainly outside, or behind the camera.
+fn visible(index: usize, cluster: &Cluster, camera: &Camera, near: f64) -> Option<Visible> {
+    let i = &camera.intrinsics;
+    let (middle, half) = in_camera(cluster.bounds, camera);
+    let (low, high) = (middle - half, middle + half);
+    if high.z < near {
+        return None;
+    }
+    let mut visible = Visible {
+        nearest: 0,
+        cluster: index as u32,
+        columns: 0..i.width,
+        rows: 0..i.height,
+    };
+    // Whatever is not finite fails a comparison and leaves the whole image.
+    if low.z >= near {
+        let pixels = |low_at: f64, high_at: f64, focal: f64, principal: f64, size: u32| {
+            let ends = [
+                low_at / low.z,
+                low_at / high.z,
+                high_at / low.z,
+                high_at / high.z,
+            ];
+            let [a, b, c, d] = ends.map(|end| focal * end);
+            let (first, last) = (
+                lower(lower(a, b), lower(c, d)),
+                upper(upper(a, b), upper(c, d)),
+            );
+            let slack = (first.abs() + last.abs() + principal.abs()) * BOUNDS_SLACK + BOX_SLACK;
+            let (first, last) = (first + principal - slack, last + principal + slack);
+            let whole = first.is_nan() || last.is_nan();
+            if whole {
+                0..size
+            } else {
+                (first as u32).min(size)..(last as u32).saturating_add(1).min(size)
+            }
+        };
+        visible.nearest = farness(low.z.recip());
+        visible.columns = pixels(low.x, high.x, i.fx, i.cx, i.width);
+        visible.rows = pixels(low.y, high.y, i.fy, i.cy, i.height);
+    }
+    (!visible.columns.is_empty() && !visible.rows.is_empty()).then_some(visible)
 }
 
 /// `f64::min` without its care for NaN, which is a third of the cost of a small triangle.
@@ -463,27 +628,12 @@ impl Edge {
     }
 }
 
-/// Draws one triangle that lies wholly in front of the near plane; see [`Projected::scan`].
+/// Calls `put(row, column, 1/depth)` for each of `samples` that one triangle covers, which lies wholly in front of the
+/// near plane.
 #[inline]
-fn scan(
-    screen: &[ScreenPoint; 3],
-    samples: usize,
-    width: usize,
-    rows: &Range<usize>,
-    put: &mut impl FnMut(usize, usize, f64),
-) {
-    let (columns, rows) = sample_box(screen, samples, width, rows);
-    if columns.is_empty() || rows.is_empty() {
-        return;
-    }
-    // From here on in units of samples: sample i lies exactly at i + 0.5. Scaling moves a vertex by a rounding, but
-    // for all its triangles alike.
-    let scale = samples as f64;
-    let [a, mut b, mut c] = screen.map(|point| ScreenPoint {
-        x: point.x * scale,
-        y: point.y * scale,
-        ..point
-    });
+fn scan(screen: &[ScreenPoint; 3], samples: &SampleBox, put: &mut impl FnMut(usize, usize, f64)) {
+    let columns = samples.columns.0 as usize..samples.columns.1 as usize;
+    let [a, mut b, mut c] = *screen;
     let area = Edge::new(a, b).value(c.x, c.y);
     if area == 0.0 || area.is_nan() {
         return;
@@ -492,24 +642,13 @@ fn scan(
         std::mem::swap(&mut b, &mut c);
     }
     let edges = [Edge::new(a, b), Edge::new(b, c), Edge::new(c, a)];
-    // 1/depth is affine on the screen. The bounds keep slivers, whose slopes are all rounding, on the triangle.
-    let (ux, uy, u) = (b.x - a.x, b.y - a.y, b.inverse_depth - a.inverse_depth);
-    let (vx, vy, v) = (c.x - a.x, c.y - a.y, c.inverse_depth - a.inverse_depth);
-    let per_area = (ux * vy - uy * vx).recip();
-    let finite = |slope: f64| if slope.is_finite() { slope } else { 0.0 };
-    let slope_x = finite((u * vy - v * uy) * per_area);
-    let slope_y = finite((v * ux - u * vx) * per_area);
-    let farthest = lower(lower(a.inverse_depth, b.inverse_depth), c.inverse_depth);
-    let nearest = upper(upper(a.inverse_depth, b.inverse_depth), c.inverse_depth);
-    for row in rows {
+    // Most small triangles cover no sample: their plane is found when it is needed.
+    let mut plane = None;
+    for row in samples.rows.0 as usize..samples.rows.1 as usize {
         let y = row as f64 + 0.5;
-        let row_depth = a.inverse_depth + slope_y * (y - a.y);
         let mut emit = |column: usize, x: f64| {
-            put(
-                row,
-                column,
-                lower(upper(row_depth + slope_x * (x - a.x), farthest), nearest),
-            );
+            let plane = plane.get_or_insert_with(|| Plane::new(a, b, c));
+            put(row, column, plane.inverse_depth(x, y));
         };
         if columns.len() <= NARROW {
             for column in columns.clone() {
@@ -522,6 +661,50 @@ fn scan(
         } else {
             span(&edges, &columns, y).for_each(|column| emit(column, column as f64 + 0.5));
         }
+    }
+}
+
+/// 1/depth over a triangle: affine on the screen.
+struct Plane {
+    corner: ScreenPoint,
+    slope_x: f64,
+    slope_y: f64,
+    /// Bounds keep slivers, whose slopes are all rounding, on the triangle.
+    farthest: f64,
+    nearest: f64,
+}
+
+impl Plane {
+    #[inline]
+    fn new(a: ScreenPoint, b: ScreenPoint, c: ScreenPoint) -> Self {
+        // From the farthest corner: one that was clipped at the near plane lies so far outside the image that
+        // differences from it round away what is inside.
+        let at = |point: ScreenPoint| point.inverse_depth;
+        let (a, b, c) = if at(b) < at(a) && at(b) <= at(c) {
+            (b, c, a)
+        } else if at(c) < at(a) {
+            (c, a, b)
+        } else {
+            (a, b, c)
+        };
+        let (ux, uy, u) = (b.x - a.x, b.y - a.y, b.inverse_depth - a.inverse_depth);
+        let (vx, vy, v) = (c.x - a.x, c.y - a.y, c.inverse_depth - a.inverse_depth);
+        let per_area = (ux * vy - uy * vx).recip();
+        let finite = |slope: f64| if slope.is_finite() { slope } else { 0.0 };
+        Self {
+            corner: a,
+            slope_x: finite((u * vy - v * uy) * per_area),
+            slope_y: finite((v * ux - u * vx) * per_area),
+            farthest: at(a),
+            nearest: upper(at(b), at(c)),
+        }
+    }
+
+    #[inline]
+    fn inverse_depth(&self, x: f64, y: f64) -> f64 {
+        let row = self.corner.inverse_depth + self.slope_y * (y - self.corner.y);
+        let value = row + self.slope_x * (x - self.corner.x);
+        lower(upper(value, self.farthest), self.nearest)
     }
 }
 
@@ -604,14 +787,31 @@ mod tests {
         })
     }
 
+    fn grid(samples: usize) -> Grid {
+        Grid {
+            samples: samples as f64,
+            columns: 37 * samples as u32,
+            rows: 0..29 * samples as u32,
+        }
+    }
+
     fn hits(mesh: &Mesh, samples: usize) -> Vec<u32> {
-        let camera = camera();
-        let scene = Projected::new(mesh, &camera);
+        let (camera, drawable) = (camera(), Drawable::new(mesh));
+        let view = View::new(&drawable, &camera, samples);
+        let mut projected = Projected {
+            points: [ScreenPoint::default(); VERTICES],
+            boxes: [SampleBox::default(); VERTICES],
+        };
         let mut hits = vec![0; 37 * 29 * samples * samples];
-        for triangle in 0..mesh.triangles.len() as u32 {
-            scene.scan(triangle, samples, 37, &(0..29), |row, column, _| {
-                hits[row * 37 * samples + column] += 1;
-            });
+        for cluster in drawable.clusters() {
+            view.scan(
+                cluster,
+                &grid(samples),
+                &mut projected,
+                |row, column, _, _| {
+                    hits[row * 37 * samples + column] += 1;
+                },
+            );
         }
         hits
     }
@@ -647,7 +847,8 @@ mod tests {
             let point = |x, y| ScreenPoint { x, y, inverse_depth: 1.0 };
             let mut screen = [point(ax, ay), point(bx, by), point(cx, cy)];
             let mut drawn = vec![0; 37 * 29];
-            scan(&screen, 1, 37, &(0..29), &mut |row, column, _| drawn[row * 37 + column] += 1);
+            let samples = SampleBox::join(screen.each_ref().map(|point| grid(1).around(point)));
+            scan(&screen, &samples, &mut |row, column, _| drawn[row * 37 + column] += 1);
             let area = Edge::new(screen[0], screen[1]).value(cx, cy);
             if area < 0.0 {
                 screen.swap(1, 2);

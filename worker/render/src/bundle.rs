@@ -9,7 +9,7 @@ use std::path::Path;
 use glam::DVec3;
 use ign_bundle::manifest::{Layer, NetworkInput};
 use ign_bundle::{Bundle, BundleError, NetworkDescription, Precision, Tensors};
-use ign_geometry::{Camera, CameraIntrinsics, Mesh, Similarity};
+use ign_geometry::{Camera, CameraIntrinsics, Drawable, Similarity};
 use ign_nets::composition::{BlendComposition, PaperComposition};
 use ign_nets::effects::{PaperEffects, PointEffects};
 use ign_nets::{Builder, NetError, Params};
@@ -209,7 +209,7 @@ fn layer(name: &str, shape: &[i64]) -> Option<Layer> {
 #[derive(Debug)]
 pub struct BundleRenderer {
     bundle: Bundle,
-    mesh: Mesh,
+    proxy: Drawable,
     normalised_from_world: Similarity,
     model: Model,
     device: Device,
@@ -244,11 +244,12 @@ impl BundleRenderer {
             .as_ref()
             .map(|network| load_composition(&bundle, network, settings.k, device))
             .transpose()?;
-        let references = References::new(&mesh, &images, settings.recipe, device);
+        let proxy = Drawable::new(&mesh);
+        let references = References::new(&proxy, &images, settings.recipe, device);
         let model = Model::new(references, settings, effects, composition);
         Ok(Self {
             bundle,
-            mesh,
+            proxy,
             normalised_from_world,
             model,
             device,
@@ -267,7 +268,7 @@ impl BundleRenderer {
 
     /// Renders one view; `camera` is in the normalised frame.
     pub fn render_normalised(&self, camera: &Camera) -> RgbImage {
-        let target = Target::new(&self.mesh, camera, &self.model.settings, self.device);
+        let target = Target::new(&self.proxy, camera, &self.model.settings, self.device);
         crate::to_image(&self.model.image(&target))
     }
 

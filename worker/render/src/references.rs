@@ -1,6 +1,6 @@
 //! The fixed reference views: their pictures, depth from the proxy, and the cross-projection into a target.
 
-use ign_geometry::{Camera, GBuffer, Mesh, select};
+use ign_geometry::{Camera, Drawable, GBuffer, select};
 use ign_nets::warp::{Sources, directions};
 use tch::{Device, Kind, Tensor};
 
@@ -54,8 +54,13 @@ pub struct Warped {
 }
 
 impl References {
-    /// Rasterises the proxy for each reference view.
-    pub fn new(mesh: &Mesh, images: &[ReferenceImage], recipe: Recipe, device: Device) -> Self {
+    /// Draws the proxy for each reference view.
+    pub fn new(
+        proxy: &Drawable,
+        images: &[ReferenceImage],
+        recipe: Recipe,
+        device: Device,
+    ) -> Self {
         let cameras: Vec<Camera> = images.iter().map(|image| image.camera).collect();
         let width = cameras
             .iter()
@@ -71,7 +76,7 @@ impl References {
         let (mut depths, mut colors, mut alphas, mut geometry) =
             (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for image in images {
-            let gbuffer = GBuffer::render(mesh, &image.camera, 4);
+            let gbuffer = proxy.g_buffer(&image.camera, 4);
             let (iw, ih) = (gbuffer.width as usize, gbuffer.height as usize);
             let mut depth = vec![0.0f32; (h * w) as usize];
             let mut color = vec![0.0f32; (h * w * 3) as usize];
@@ -118,7 +123,7 @@ impl References {
             geometry: Tensor::stack(&geometry, 0).to_device(device),
             selection: cameras
                 .iter()
-                .map(|camera| GBuffer::render(mesh, &selection_camera(camera), 1))
+                .map(|camera| proxy.g_buffer(&selection_camera(camera), 1))
                 .collect(),
             cameras,
             size: (h, w),

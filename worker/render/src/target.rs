@@ -1,6 +1,6 @@
 //! The geometry of one view to be rendered: visible surface points, their pixels, and coverage.
 
-use ign_geometry::{Camera, GBuffer, Mesh};
+use ign_geometry::{Camera, Drawable, GBuffer};
 use ign_nets::color;
 use tch::{Device, Kind, Tensor};
 
@@ -38,15 +38,20 @@ pub struct Target {
 }
 
 impl Target {
-    /// Rasterises `mesh` (normalised frame) for `camera` (normalised frame).
-    pub fn new(mesh: &Mesh, camera: &Camera, settings: &RenderSettings, device: Device) -> Self {
+    /// Draws the proxy (normalised frame) for `camera` (normalised frame).
+    pub fn new(
+        proxy: &Drawable,
+        camera: &Camera,
+        settings: &RenderSettings,
+        device: Device,
+    ) -> Self {
         let s = settings.supersample.max(1);
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let fine = Camera {
             intrinsics: camera.intrinsics.resized(width * s, height * s),
             camera_from_world: camera.camera_from_world,
         };
-        let gbuffer = GBuffer::render(mesh, &fine, CELL_SAMPLES);
+        let gbuffer = proxy.g_buffer(&fine, CELL_SAMPLES);
 
         let shading = settings.recipe.normals(&gbuffer);
         let (mut points, mut normals, mut pixel, mut weight) =
@@ -98,7 +103,7 @@ impl Target {
 
         let mut target = Self {
             camera: *camera,
-            selection: GBuffer::render(mesh, &selection_camera(camera), 1),
+            selection: proxy.g_buffer(&selection_camera(camera), 1),
             triangles,
             points,
             normals,

@@ -2,7 +2,7 @@
 //! where the object is not. Finite is tested before the compositing, which would replace what is not.
 
 use glam::{DAffine3, DVec3};
-use ign_geometry::{Camera, CameraIntrinsics, Mesh};
+use ign_geometry::{Camera, CameraIntrinsics, Drawable, Mesh};
 use ign_nets::Builder;
 use ign_nets::composition::{BlendComposition, PaperComposition};
 use ign_nets::effects::{PaperEffects, PointEffects};
@@ -168,7 +168,7 @@ fn reference_sets() -> Vec<(&'static str, Vec<ReferenceImage>)> {
 }
 
 fn model(mesh: &Mesh, images: &[ReferenceImage], recipe: Recipe) -> Model {
-    let references = References::new(mesh, images, recipe, Device::Cpu);
+    let references = References::new(&Drawable::new(mesh), images, recipe, Device::Cpu);
     let settings = RenderSettings {
         recipe,
         ..RenderSettings::default()
@@ -227,6 +227,7 @@ fn assert_image(what: &str, image: &Tensor, target: &Target) {
 #[test]
 fn every_target_from_every_reference_set_is_finite_and_bounded() {
     let mesh = mesh();
+    let proxy = Drawable::new(&mesh);
     tch::manual_seed(41);
     let mut painted = 0;
     for (set, images) in reference_sets() {
@@ -236,7 +237,7 @@ fn every_target_from_every_reference_set_is_finite_and_bounded() {
             let every = recipe == Recipe::Standard || set == "five views";
             for (view, camera) in targets() {
                 let what = format!("{recipe:?}, {set}, {view}");
-                let target = Target::new(&mesh, &camera, &model.settings, Device::Cpu);
+                let target = Target::new(&proxy, &camera, &model.settings, Device::Cpu);
                 match recipe {
                     Recipe::Standard => {
                         let input = model.blend_input(&target);
