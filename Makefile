@@ -5,7 +5,7 @@
 #   make test                       everything: formats, lints, all tests; ends with "N passed, N failed"
 #   make lint                       formats and lints alone
 #   make setup                      libtorch into the per-user cache, linked as .libtorch
-#   make bench                      reserved for the benchmarks of speed against error
+#   make bench [BENCH=name] [ARGS="--views 20 --rounds 1"]   speed beside a peer, one case or all; see tests/bench
 
 .POSIX:
 .PHONY: bake test lint bench setup build
@@ -19,6 +19,7 @@ OBJECT =
 PRESET = standard
 OUT =
 ARGS =
+BENCH =
 # The demo finishes within four minutes on two cores.
 DEMO_ARGS = --size 128 --budget-secs 90
 
@@ -52,7 +53,7 @@ lint: setup
 	$(CARGO) clippy --workspace --all-targets --locked -- -D warnings
 
 bench:
-	@echo 'bench: no benchmarks yet; the name is reserved'
+	python3 tests/bench/run.py $(BENCH) $(ARGS)
 
 setup:
 	worker/setup-libtorch.sh

@@ -1,0 +1,65 @@
+"""What is measured. A case pairs a benchmark program of this repository with a peer that does the same work.
+
+Both sides take `--views N` and print one line of JSON: `items` (what was done), `secs` (time for it), `prepare_secs`
+(time once, whatever N), `peak_bytes` (VmHWM) and `check` (figures that both sides must agree on). Our program takes
+its threads from RAYON_NUM_THREADS and writes what the peer reads with `--export DIR`; the peer is a script in `peers/`
+that takes `--data DIR` and `--threads N`.
+"""
+
+from dataclasses import dataclass
+from typing import Callable
+
+
+@dataclass(frozen=True)
+class Case:
+    name: str
+    does: str
+    package: str
+    """Crate, and the name of its benchmark target with fixed arguments."""
+    bench: str
+    arguments: tuple[str, ...]
+    peer: str
+    unit: str
+    views: int
+    limit_bytes: Callable[[dict], float]
+    """Bytes that have to move per item, from our side's result; over the measured bandwidth: the machine's limit."""
+    limit_means: str
+    peer_runs: int | None = None
+    """At most this many runs of the peer, where it is slow."""
+
+
+def mesh_bytes(result):
+    """Half of the mesh, the side that is seen, read once per view: f32 positions and indices."""
+    return (12 * result["vertices"] + 12 * result["triangles"]) / 2
+
+
+def map_bytes(result, per_pixel):
+    return per_pixel * result["pixels"] / result["items"]
+
+
+CASES = [
+    Case(
+        name="depth",
+        does="depth and triangle of each pixel (Drawable::rasterize); peer: Open3D RaycastingScene, casting alone",
+        package="ign-geometry", bench="gbuffers", arguments=("--maps", "depth"),
+        peer="open3d_depth.py", unit="view", views=1000,
+        limit_bytes=lambda r: mesh_bytes(r) + map_bytes(r, 8),
+        limit_means="the visible half of the mesh read once, 8 bytes a pixel written once",
+    ),
+    Case(
+        name="gbuffers",
+        does="all maps of a G-buffer (Drawable::g_buffer); peer: the same as for depth, so it does less",
+        package="ign-geometry", bench="gbuffers", arguments=("--maps", "all"),
+        peer="open3d_depth.py", unit="view", views=1000,
+        limit_bytes=lambda r: mesh_bytes(r) + map_bytes(r, 61),
+        limit_means="the visible half of the mesh read once, 61 bytes a pixel written once",
+    ),
+    Case(
+        name="selection",
+        does="20 references by lazy greedy (select::Candidates::choose); peer: the same greedy, every gain, in NumPy",
+        package="ign-geometry", bench="selection", arguments=(),
+        peer="numpy_greedy.py", unit="view", views=1000, peer_runs=1,
+        limit_bytes=lambda r: r["table_bytes"] * (1 + len(r["check"]["chosen"])) / r["items"],
+        limit_means="the tables of costs, rays and weights read once for the first gains and once per choice",
+    ),
+]
