@@ -103,6 +103,7 @@ def main():
         ("Postgres", install_postgres()),
         ("libtorch", run("worker/setup-libtorch.sh")),
         ("formats", run("cargo", "fmt", "--all", "--check")),
+        ("dependencies", run("python3", ".ci/dependencies.py")),
         ("lints", run("cargo", "clippy", "--locked", "--workspace", "--all-targets", "--", "-D", "warnings")),
     ]
     passed, failed = run_tests()

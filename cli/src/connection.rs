@@ -9,6 +9,7 @@ use std::time::Duration;
 use ign_proto::MAX_MESSAGE_BYTES;
 use ign_proto::v1::bundles_client::BundlesClient;
 use ign_proto::v1::jobs_client::JobsClient;
+use ign_proto::v1::tokens_client::TokensClient;
 use reqwest::Url;
 use serde::Deserialize;
 use tonic::metadata::{Ascii, MetadataValue};
@@ -255,6 +256,11 @@ impl Connection {
     /// Client of the bundle calls.
     pub(crate) fn bundles(&self) -> BundlesClient<Admitted> {
         BundlesClient::new(self.admitted()).max_decoding_message_size(MAX_MESSAGE_BYTES)
+    }
+
+    /// Client of the token calls.
+    pub(crate) fn tokens(&self) -> TokensClient<Admitted> {
+        TokensClient::new(self.admitted())
     }
 
     /// Client of the blobs of one object.

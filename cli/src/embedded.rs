@@ -193,6 +193,7 @@ async fn start_coordinator(
         endpoint_file: Some(data.join("endpoint.json")),
         settings: ign_queue::Settings::default(),
         redirect_blobs: false,
+        limits: ign_coordinator::Limits::default(),
     };
     let shutdown = async {
         // Asked to stop, or the service was dropped: both mean stop.

@@ -23,7 +23,7 @@ use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser};
 
-use crate::commands::{bake, bundle, completions, doctor, jobs, status, submit, up};
+use crate::commands::{bake, bundle, completions, doctor, jobs, status, submit, token, up};
 use crate::connection::ConnectionArgs;
 use crate::output::Format;
 use crate::problem::{Exit, Problem};
@@ -77,6 +77,9 @@ enum Command {
     /// Look at model bundles, fetch and verify them
     #[command(subcommand)]
     Bundle(bundle::Command),
+    /// Make, list, rotate and revoke bearer tokens
+    #[command(subcommand)]
+    Token(token::Command),
     /// Check that everything needed is there and works
     Doctor(doctor::Args),
     /// Print completions for a shell
@@ -141,6 +144,7 @@ async fn run(cli: Cli) -> Result<(), Problem> {
         Command::Retry(args) => jobs::retry(&context, &args).await,
         Command::Wait(args) => jobs::wait(&context, &args).await,
         Command::Bundle(command) => bundle::run(&context, &command).await,
+        Command::Token(command) => token::run(&context, &command).await,
         Command::Doctor(args) => doctor::run(&context, &args).await,
         Command::Completions(args) => completions::run(&args, &mut Cli::command()),
     }

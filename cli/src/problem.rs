@@ -166,6 +166,9 @@ impl From<tonic::Status> for Problem {
                 Self::unreachable(format!("the coordinator cannot work now: {message}"))
                     .hint("ignctl doctor")
             }
+            cause @ Cause::Forbidden { .. } => Self::failed(cause.to_string())
+                .hint("ask the service's operator for a token with this scope"),
+            cause @ Cause::TooMany { .. } => Self::unreachable(cause.to_string()),
             cause @ Cause::Unauthenticated => {
                 Self::failed(cause.to_string()).hint("check --token-file (IGN_TOKEN_FILE)")
             }

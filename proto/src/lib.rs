@@ -2,15 +2,18 @@
 //!
 //! - [`v1`]: messages, clients and servers generated from `ign/v1/ign.proto`.
 //! - [`ids`]: newtypes for names and digests; a value that exists is valid.
+//! - [`grant`]: what a bearer token allows.
 //! - [`manifest`]: captures and bundles as OCI image manifests, written and read.
 //! - [`status`]: the one place that builds or reads a [`tonic::Status`].
 //!
 //! Invariant: this crate does no I/O and knows nothing of stores or jobs' rules.
 
+pub mod grant;
 pub mod ids;
 pub mod manifest;
 pub mod status;
 
+pub use grant::{Grant, Scope};
 pub use ids::{
     Attempt, CollectionId, Digest, FilePath, IdError, JobId, ObjectId, ObjectName, WorkerId,
 };

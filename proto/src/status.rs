@@ -64,6 +64,11 @@ pub enum Cause {
         /// When to try again.
         retry_after: Duration,
     },
+    /// Too many requests in a short time. `RESOURCE_EXHAUSTED`, `RetryInfo`.
+    TooMany {
+        /// When to try again.
+        retry_after: Duration,
+    },
     /// No token, or a wrong one. `UNAUTHENTICATED`, `ErrorInfo`.
     Unauthenticated,
     /// The token does not allow this. `PERMISSION_DENIED`, `ErrorInfo`.
@@ -142,6 +147,10 @@ impl Cause {
                 details.set_retry_info(Some(*retry_after));
                 Code::Unavailable
             }
+            Self::TooMany { retry_after } => {
+                details.set_retry_info(Some(*retry_after));
+                Code::ResourceExhausted
+            }
             Self::Unauthenticated => {
                 info(&mut details, NO_TOKEN, &[]);
                 Code::Unauthenticated
@@ -201,6 +210,10 @@ impl Cause {
                 message: status.message().to_owned(),
                 retry_after: info.retry_delay.unwrap_or_default(),
             }),
+            // Without it: a message that is too large.
+            (Code::ResourceExhausted, _) => details.retry_info().map(|info| Self::TooMany {
+                retry_after: info.retry_delay.unwrap_or_default(),
+            }),
             (Code::Unauthenticated, _) => Some(Self::Unauthenticated),
             (Code::PermissionDenied, Some(FORBIDDEN)) => Some(Self::Forbidden {
                 message: field("message"),
@@ -220,7 +233,7 @@ impl Cause {
     /// retried too.
     pub fn retryable(&self) -> bool {
         match self {
-            Self::Conflict | Self::Unavailable { .. } => true,
+            Self::Conflict | Self::Unavailable { .. } | Self::TooMany { .. } => true,
             // A connection that broke shows as any of these; a server that has no such method, or refuses a message's
             // size, does not.
             Self::Transport { code, .. } => matches!(
@@ -238,7 +251,9 @@ impl Cause {
     /// How long to wait before trying again, when the server said so.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
-            Self::Unavailable { retry_after, .. } => Some(*retry_after),
+            Self::Unavailable { retry_after, .. } | Self::TooMany { retry_after } => {
+                Some(*retry_after)
+            }
             _ => None,
         }
     }
@@ -253,6 +268,7 @@ impl Cause {
             Self::NotAllowed { reason, .. } => reason,
             Self::Conflict => "CONFLICT",
             Self::Unavailable { .. } => "UNAVAILABLE",
+            Self::TooMany { .. } => "TOO_MANY",
             Self::Unauthenticated => NO_TOKEN,
             Self::Forbidden { .. } => FORBIDDEN,
             Self::Internal { .. } => "INTERNAL",
@@ -273,6 +289,11 @@ impl fmt::Display for Cause {
             Self::NotAllowed { message, .. } | Self::Forbidden { message } => f.write_str(message),
             Self::Conflict => f.write_str("another write came first; try again"),
             Self::Unavailable { message, .. } => write!(f, "{message}"),
+            Self::TooMany { retry_after } => write!(
+                f,
+                "too many requests; try again in {} s",
+                retry_after.as_secs().max(1)
+            ),
             Self::Unauthenticated => f.write_str("a valid bearer token is required"),
             Self::Internal { request_id } => write!(
                 f,
@@ -345,6 +366,13 @@ mod tests {
                     retry_after: Duration::from_secs(2),
                 },
                 Code::Unavailable,
+                true,
+            ),
+            (
+                Cause::TooMany {
+                    retry_after: Duration::from_secs(3),
+                },
+                Code::ResourceExhausted,
                 true,
             ),
             (Cause::Unauthenticated, Code::Unauthenticated, false),

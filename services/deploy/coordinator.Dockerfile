@@ -10,7 +10,8 @@ FROM debian:bookworm-slim
 RUN apt-get update \
     && apt-get install -y --no-install-recommends ca-certificates curl \
     && rm -rf /var/lib/apt/lists/* \
-    && useradd --uid 10001 --create-home --home-dir /var/lib/ign ign
+    && useradd --uid 10001 --create-home --home-dir /var/lib/ign ign \
+    && install -d -o ign /var/lib/ign/tokens
 COPY --from=build /out/ /usr/local/bin/
 COPY services/deploy/with-secrets.sh /usr/local/bin/with-secrets
 USER ign

@@ -24,6 +24,6 @@ RUN apt-get update \
 # The worker finds libtorch relative to itself, as in a checkout.
 COPY --from=build /out/ /opt/ign/
 COPY services/deploy/with-secrets.sh /usr/local/bin/with-secrets
-RUN ln -s /opt/ign/target/release/ign-worker /usr/local/bin/ign-worker && install -d -o ign /var/lib/ign/work
+RUN ln -s /opt/ign/target/release/ign-worker /usr/local/bin/ign-worker && install -d -o ign /var/lib/ign/work /var/lib/ign/tokens
 USER ign
 ENTRYPOINT ["with-secrets", "ign-worker"]

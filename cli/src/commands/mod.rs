@@ -8,4 +8,5 @@ pub(crate) mod jobs;
 pub(crate) mod manifest;
 pub(crate) mod status;
 pub(crate) mod submit;
+pub(crate) mod token;
 pub(crate) mod up;

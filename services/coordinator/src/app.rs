@@ -6,7 +6,8 @@ use ign_queue::Store;
 use ign_registry::Registry;
 use tokio_util::sync::CancellationToken;
 
-use crate::auth::Token;
+use crate::auth::Doorkeeper;
+use crate::fetch::Contents;
 use crate::metrics::Metrics;
 use crate::publish::Mirror;
 
@@ -14,7 +15,8 @@ use crate::publish::Mirror;
 pub(crate) struct App {
     pub(crate) store: Arc<dyn Store>,
     pub(crate) registry: Registry,
-    pub(crate) token: Token,
+    pub(crate) doorkeeper: Doorkeeper,
+    pub(crate) contents: Contents,
     pub(crate) metrics: Metrics,
     pub(crate) mirror: Mirror,
     pub(crate) redirect_blobs: bool,

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use ign_queue::{Settings, StoreError};
 use ign_registry::{RegistryError, StoreConfig};
 
+use crate::limits::Limits;
+
 /// Settings of one coordinator.
 #[derive(Clone, Debug)]
 pub struct Config {
@@ -15,7 +17,7 @@ pub struct Config {
     pub database: String,
     /// Where blobs, manifests and versions lie.
     pub store: StoreConfig,
-    /// File that holds the bearer token of all clients.
+    /// File that holds the root token: all scopes, everywhere.
     pub token_file: PathBuf,
     /// Where to write `{"url","pid","token_file"}` once listening; removed at the end.
     pub endpoint_file: Option<PathBuf>,
@@ -24,6 +26,8 @@ pub struct Config {
     /// Answer blob reads with a redirect to a signed URL where the store can sign. Clients must be able to reach the
     /// store under the same address.
     pub redirect_blobs: bool,
+    /// What a peer may cost.
+    pub limits: Limits,
 }
 
 /// Why a coordinator did not start or had to end.

@@ -25,8 +25,8 @@ use axum::http::header::{
 };
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
-use axum::routing::get;
-use axum::{Json, Router};
+use axum::routing::{MethodRouter, get, post};
+use axum::{Extension, Json};
 use bytes::Bytes;
 use futures::{Stream, TryStreamExt as _};
 use ign_proto::manifest::{MAX_BYTES, MEDIA_TYPE};
@@ -36,18 +36,16 @@ use ign_registry::{BodyError, RegistryError, UploadId};
 use serde::Deserialize;
 use tokio_stream::StreamExt as _;
 
+use crate::access::Caller;
 use crate::app::App;
 use crate::error::internal;
+use crate::fetch::Item;
 use crate::http_answer::{Refused, oci_error};
+use crate::limits::{MAX_BLOB_BYTES, SIGNED_FOR};
 use crate::trace;
 
-/// Largest blob.
-const MAX_BLOB_BYTES: u64 = 64 * 1024 * 1024 * 1024;
 /// Longest silence in the middle of a body.
 const IDLE: Duration = Duration::from_mins(1);
-/// A signed URL lives this long; a read that has begun goes on.
-const SIGNED_FOR: Duration = Duration::from_mins(10);
-
 const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 const UPLOAD_UUID: HeaderName = HeaderName::from_static("docker-upload-uuid");
 
@@ -55,26 +53,29 @@ type Answer = Result<Response, Refused>;
 type Shared = State<Arc<App>>;
 
 /// The routes under `/v2/`.
-pub(crate) fn routes() -> Router<Arc<App>> {
-    const BEGIN: &str = "/v2/{collection}/{object}/blobs/uploads";
-    let begin = || axum::routing::post(begin_upload);
-    Router::new()
-        .route("/v2/", get(|| async { Json(serde_json::json!({})) }))
-        .route("/v2/{collection}/{object}/blobs/{digest}", get(read_blob))
-        .route(BEGIN, begin())
-        .route(&format!("{BEGIN}/"), begin())
-        .route(
-            &format!("{BEGIN}/{{id}}"),
-            get(upload_state)
-                .patch(add_to_upload)
-                .put(finish_upload)
-                .delete(forget_upload),
-        )
-        .route(
+pub(crate) fn routes() -> Vec<(&'static str, MethodRouter<Arc<App>>)> {
+    let upload = get(upload_state)
+        .patch(add_to_upload)
+        .put(finish_upload)
+        .delete(forget_upload);
+    vec![
+        ("/v2/", get(|| async { Json(serde_json::json!({})) })),
+        ("/v2/{collection}/{object}/blobs/{digest}", get(read_blob)),
+        (
+            "/v2/{collection}/{object}/blobs/uploads",
+            post(begin_upload),
+        ),
+        (
+            "/v2/{collection}/{object}/blobs/uploads/",
+            post(begin_upload),
+        ),
+        ("/v2/{collection}/{object}/blobs/uploads/{id}", upload),
+        (
             "/v2/{collection}/{object}/manifests/{reference}",
             get(read_manifest).put(put_manifest),
-        )
-        .route("/v2/{collection}/{object}/tags/list", get(list_tags))
+        ),
+        ("/v2/{collection}/{object}/tags/list", get(list_tags)),
+    ]
 }
 
 /// The object in the path; its names are checked here, before anything else.
@@ -103,13 +104,18 @@ struct DigestQuery {
 
 async fn read_blob(
     State(app): Shared,
+    Extension(caller): Extension<Arc<Caller>>,
     Path(object): Path<ObjectPath>,
     Path(BlobPath { digest }): Path<BlobPath>,
     method: Method,
     headers: HeaderMap,
 ) -> Answer {
-    object.name()?;
+    let object = object.name()?;
     let digest: Digest = digest.parse()?;
+    // Whether a blob is there is told to all who may upload: it is how they know what to send.
+    if method != Method::HEAD {
+        app.may_fetch(&caller, &object, Item::Blob(&digest)).await?;
+    }
     let size = app
         .registry
         .blob_size(&digest)
@@ -474,8 +480,10 @@ struct ManifestPath {
 
 async fn read_manifest(
     State(app): Shared,
+    Extension(caller): Extension<Arc<Caller>>,
     Path(object): Path<ObjectPath>,
     Path(ManifestPath { reference }): Path<ManifestPath>,
+    method: Method,
     headers: HeaderMap,
 ) -> Answer {
     let object = object.name()?;
@@ -489,6 +497,10 @@ async fn read_manifest(
                 .manifest_digest
         }
     };
+    if method != Method::HEAD {
+        app.may_fetch(&caller, &object, Item::Manifest(&digest))
+            .await?;
+    }
     let bytes = app
         .registry
         .manifest(&digest)

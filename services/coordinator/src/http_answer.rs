@@ -47,6 +47,7 @@ impl IntoResponse for Refused {
             | Cause::NotAllowed { .. }
             | Cause::Conflict => (StatusCode::CONFLICT, "CONFLICT"),
             Cause::Unavailable { .. } => (StatusCode::SERVICE_UNAVAILABLE, "UNAVAILABLE"),
+            Cause::TooMany { .. } => (StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS"),
             Cause::Unauthenticated => (StatusCode::UNAUTHORIZED, "UNAUTHORIZED"),
             Cause::Forbidden { .. } => (StatusCode::FORBIDDEN, "DENIED"),
             Cause::Internal { .. } | Cause::Transport { .. } => {
@@ -55,9 +56,10 @@ impl IntoResponse for Refused {
         };
         let mut response = oci_error(status, code, &self.0.to_string());
         if let Some(delay) = self.0.retry_after() {
-            response
-                .headers_mut()
-                .insert(RETRY_AFTER, HeaderValue::from(delay.as_secs()));
+            response.headers_mut().insert(
+                RETRY_AFTER,
+                HeaderValue::from(delay.as_secs_f64().ceil().max(1.0) as u64),
+            );
         }
         response
     }
@@ -70,4 +72,17 @@ pub(crate) fn oci_error(status: StatusCode, code: &str, message: &str) -> Respon
         Json(serde_json::json!({"errors": [{"code": code, "message": message}]})),
     )
         .into_response()
+}
+
+/// What a route that does not exist answers.
+pub(crate) fn unknown(headers: &HeaderMap) -> Response {
+    let message = "no such route";
+    if is_grpc(headers) {
+        let cause = Cause::Transport {
+            code: tonic::Code::Unimplemented,
+            message: message.to_owned(),
+        };
+        return cause.status().into_http();
+    }
+    oci_error(StatusCode::NOT_FOUND, "UNSUPPORTED", message)
 }

@@ -1,6 +1,7 @@
 //! `ign.v1.Jobs`: submitting, looking, waiting.
 
-use std::collections::BTreeMap;
+use std::cmp::Ordering;
+use std::collections::{BTreeMap, BTreeSet};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,13 +9,16 @@ use std::time::Duration;
 use futures::Stream;
 use futures::stream::{self, StreamExt as _, TryStreamExt as _};
 use ign_proto::v1::jobs_server::Jobs;
-use ign_proto::{Cause, Digest, JobId, Kind, Manifest, v1};
-use ign_queue::{Job, JobFilter, JobState, StoreError, Submit};
+use ign_proto::{Cause, CollectionId, Digest, JobId, Kind, Manifest, Scope, v1};
+use ign_queue::store::MAX_PAGE;
+use ign_queue::{Job, JobFilter, JobPage, JobState, Status as Screen, StoreError, Submit, Worker};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
+use crate::access::{Caller, Reach};
 use crate::app::App;
+use crate::auth::caller;
 use crate::convert::{
     job_spec, job_state, optional, parsed, required, to_bundle, to_job, to_log_line, to_timestamp,
     to_worker,
@@ -68,12 +72,79 @@ impl App {
             .await
     }
 
-    /// By id, or by a prefix of it.
-    async fn find_job(&self, id: &str) -> Result<Job, Refused> {
-        Ok(match id.parse::<JobId>() {
+    /// By id, or by a prefix of it. A job of a collection where the caller lacks the scope does not exist for it.
+    async fn find_job(&self, caller: &Caller, scope: Scope, id: &str) -> Result<Job, Refused> {
+        let job = match id.parse::<JobId>() {
             Ok(id) => self.store.get(id).await?,
             Err(_) => self.store.find(id).await?,
-        })
+        };
+        if caller.may(scope, &job.spec.object.collection) {
+            Ok(job)
+        } else {
+            Err(Cause::absent("job", id).into())
+        }
+    }
+
+    /// A page of the jobs of all collections in reach.
+    async fn page(
+        &self,
+        reach: &Reach,
+        filter: &JobFilter,
+        after: Option<JobId>,
+        limit: u32,
+    ) -> Result<JobPage, Refused> {
+        let mut jobs = Vec::new();
+        let mut more = false;
+        for collection in reach.each() {
+            let filter = JobFilter {
+                collection,
+                ..filter.clone()
+            };
+            let page = self.store.list(&filter, after, limit).await?;
+            more |= page.next.is_some();
+            jobs.extend(page.jobs);
+        }
+        // What a later page of any collection holds is older than what its own page held.
+        let limit = limit.clamp(1, MAX_PAGE) as usize;
+        jobs.sort_by_key(|job| std::cmp::Reverse(job.id));
+        more |= jobs.len() > limit;
+        jobs.truncate(limit);
+        let next = jobs.last().filter(|_| more).map(|job| job.id);
+        Ok(JobPage { jobs, next })
+    }
+
+    /// The status screen of all collections in reach.
+    async fn screen(&self, caller: &Caller, reach: &Reach) -> Result<Screen, Refused> {
+        let mut whole: Option<Screen> = None;
+        for collection in reach.each() {
+            let part = self.store.status(collection.as_ref(), STATUS_ROWS).await?;
+            match &mut whole {
+                None => whole = Some(part),
+                Some(whole) => add(whole, part),
+            }
+        }
+        let nowhere = "the token may read no collection".to_owned();
+        let mut whole = whole.ok_or(Cause::Forbidden { message: nowhere })?;
+        if let Some(readable) = caller.reach(Scope::Read).only() {
+            self.hide_jobs(&mut whole.workers, readable).await?;
+        }
+        Ok(whole)
+    }
+
+    /// Takes away from workers what they do for other collections.
+    async fn hide_jobs(
+        &self,
+        workers: &mut [Worker],
+        readable: &BTreeSet<CollectionId>,
+    ) -> Result<(), Refused> {
+        for worker in workers {
+            if let Some(job) = worker.job
+                && !readable.contains(&self.store.get(job).await?.spec.object.collection)
+            {
+                worker.job = None;
+            }
+        }
+        Ok(())
     }
 
     /// Fails unless the digest names the manifest of a capture that is here.
@@ -96,12 +167,14 @@ impl App {
     /// One result per request, in order.
     async fn submit_all(
         &self,
+        caller: &Caller,
         requests: Vec<v1::SubmitRequest>,
     ) -> Result<Vec<Result<Job, Refused>>, Refused> {
         let parsed: Vec<Result<Submit, Refused>> = requests
             .into_iter()
             .map(|request| {
                 let spec = job_spec(required(request.spec, "spec")?)?;
+                caller.require(&[Scope::Submit], &spec.object.collection)?;
                 Ok(Submit {
                     request_id: request.request_id,
                     spec,
@@ -154,7 +227,9 @@ impl Jobs for JobsApi {
     type LogsStream = AnswerStream<v1::LogLine>;
 
     async fn submit(&self, request: Request<v1::SubmitRequest>) -> Answer<v1::Job> {
-        let mut results = self.0.submit_all(vec![request.into_inner()]).await?;
+        let caller = caller(request.extensions())?;
+        let requests = vec![request.into_inner()];
+        let mut results = self.0.submit_all(&caller, requests).await?;
         let job = results.pop().ok_or(Refused(Cause::Conflict))??;
         tracing::info!(job.id = %job.id, job.object = %job.spec.object, "submitted");
         Ok(Response::new(self.0.full_job(&job).await?))
@@ -164,6 +239,7 @@ impl Jobs for JobsApi {
         &self,
         request: Request<Streaming<v1::SubmitRequest>>,
     ) -> Answer<v1::SubmitBatchResponse> {
+        let caller = caller(request.extensions())?;
         let mut chunks = request.into_inner().try_chunks(BATCH);
         let mut results = Vec::new();
         while let Some(chunk) = chunks.next().await {
@@ -172,7 +248,7 @@ impl Jobs for JobsApi {
                 .iter()
                 .map(|request| request.request_id.clone())
                 .collect();
-            let outcomes = self.0.submit_all(chunk).await?;
+            let outcomes = self.0.submit_all(&caller, chunk).await?;
             results.extend(ids.into_iter().zip(outcomes).map(|(request_id, outcome)| {
                 let outcome = match outcome {
                     Ok(job) => v1::submit_result::Outcome::Job(to_job(&job)),
@@ -192,14 +268,18 @@ impl Jobs for JobsApi {
     }
 
     async fn get(&self, request: Request<v1::GetJobRequest>) -> Answer<v1::Job> {
-        let job = self.0.find_job(&request.into_inner().job_id).await?;
+        let caller = caller(request.extensions())?;
+        let id = &request.get_ref().job_id;
+        let job = self.0.find_job(&caller, Scope::Read, id).await?;
         Ok(Response::new(self.0.full_job(&job).await?))
     }
 
     async fn list(&self, request: Request<v1::ListJobsRequest>) -> Answer<v1::ListJobsResponse> {
+        let reach = caller(request.extensions())?.reach(Scope::Read);
         let request = request.into_inner();
+        let reach = reach.narrow(optional(&request.collection, "collection")?)?;
         let filter = JobFilter {
-            collection: optional(&request.collection, "collection")?,
+            collection: None,
             object: optional(&request.object, "object")?,
             states: request.states().filter_map(job_state).collect(),
             labels: request.labels.into_iter().collect(),
@@ -214,12 +294,7 @@ impl Jobs for JobsApi {
         } else {
             request.page_size
         };
-        let page = self
-            .0
-            .store
-            .list(&filter, after, limit)
-            .await
-            .map_err(Refused::from)?;
+        let page = self.0.page(&reach, &filter, after, limit).await?;
         Ok(Response::new(v1::ListJobsResponse {
             jobs: self.0.full_jobs(&page.jobs).await?,
             next_page_token: page.next.map(|id| id.to_string()).unwrap_or_default(),
@@ -228,7 +303,9 @@ impl Jobs for JobsApi {
 
     async fn watch(&self, request: Request<v1::GetJobRequest>) -> Answer<Self::WatchStream> {
         let app = self.0.clone();
-        let id = app.find_job(&request.into_inner().job_id).await?.id;
+        let caller = caller(request.extensions())?;
+        let id = &request.get_ref().job_id;
+        let id = app.find_job(&caller, Scope::Read, id).await?.id;
         let (sender, receiver) = mpsc::channel(4);
         trace::spawn(async move {
             let ended = watch(&app, id, &sender).await;
@@ -238,14 +315,18 @@ impl Jobs for JobsApi {
     }
 
     async fn cancel(&self, request: Request<v1::GetJobRequest>) -> Answer<v1::Job> {
-        let id = self.0.find_job(&request.into_inner().job_id).await?.id;
+        let caller = caller(request.extensions())?;
+        let id = &request.get_ref().job_id;
+        let id = self.0.find_job(&caller, Scope::Submit, id).await?.id;
         let job = self.0.store.cancel(id).await.map_err(Refused::from)?;
         tracing::info!(job.id = %id, "cancel requested");
         Ok(Response::new(self.0.full_job(&job).await?))
     }
 
     async fn retry(&self, request: Request<v1::GetJobRequest>) -> Answer<v1::Job> {
-        let id = self.0.find_job(&request.into_inner().job_id).await?.id;
+        let caller = caller(request.extensions())?;
+        let id = &request.get_ref().job_id;
+        let id = self.0.find_job(&caller, Scope::Submit, id).await?.id;
         let job = self.0.store.retry(id).await.map_err(Refused::from)?;
         tracing::info!(job.id = %id, "retry requested");
         Ok(Response::new(self.0.full_job(&job).await?))
@@ -253,8 +334,10 @@ impl Jobs for JobsApi {
 
     async fn logs(&self, request: Request<v1::LogsRequest>) -> Answer<Self::LogsStream> {
         let app = self.0.clone();
+        let caller = caller(request.extensions())?;
         let request = request.into_inner();
-        let id = app.find_job(&request.job_id).await?.id;
+        let job = app.find_job(&caller, Scope::Read, &request.job_id).await?;
+        let id = job.id;
         let (sender, receiver) = mpsc::channel(LOG_PAGE as usize);
         trace::spawn(async move {
             let ended = follow(&app, id, request.after_seq, request.follow, &sender).await;
@@ -264,13 +347,10 @@ impl Jobs for JobsApi {
     }
 
     async fn status(&self, request: Request<v1::StatusRequest>) -> Answer<v1::StatusResponse> {
-        let collection = optional(&request.into_inner().collection, "collection")?;
-        let status = self
-            .0
-            .store
-            .status(collection.as_ref(), STATUS_ROWS)
-            .await
-            .map_err(Refused::from)?;
+        let caller = caller(request.extensions())?;
+        let collection = optional(&request.get_ref().collection, "collection")?;
+        let reach = caller.reach(Scope::Read).narrow(collection)?;
+        let status = self.0.screen(&caller, &reach).await?;
         Ok(Response::new(v1::StatusResponse {
             jobs_by_state: status
                 .counts
@@ -285,6 +365,34 @@ impl Jobs for JobsApi {
             next_queued: self.0.full_jobs(&status.next_queued).await?,
         }))
     }
+}
+
+/// Adds another collection's part to a status screen.
+fn add(whole: &mut Screen, part: Screen) {
+    for (state, count) in part.counts {
+        *whole.counts.entry(state).or_default() += count;
+    }
+    let merge = |into: &mut Vec<Job>, from: Vec<Job>, order: fn(&Job, &Job) -> Ordering| {
+        into.extend(from);
+        into.sort_by(order);
+        into.truncate(STATUS_ROWS as usize);
+    };
+    merge(&mut whole.running, part.running, |a, b| {
+        (a.started_at, a.id).cmp(&(b.started_at, b.id))
+    });
+    merge(&mut whole.recent_failures, part.recent_failures, |a, b| {
+        (b.finished_at, a.id).cmp(&(a.finished_at, b.id))
+    });
+    merge(&mut whole.next_queued, part.next_queued, |a, b| {
+        let order = |job: &Job| {
+            (
+                std::cmp::Reverse(job.spec.priority),
+                job.submitted_at,
+                job.id,
+            )
+        };
+        order(a).cmp(&order(b))
+    });
 }
 
 /// Why a stream ended before its time; none when the client went away.

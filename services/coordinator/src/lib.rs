@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!             one port, h2c and HTTP/1.1
-//!   trace -> cors -> auth -+-> ign.v1 (jobs, workers, bundles, collections) -> ign-queue (database)
+//!   trace -> cors -> auth -+-> ign.v1 (jobs, workers, bundles, tokens, ...) -> ign-queue (database)
 //!                          +-> /v2/... blobs and manifests (data_plane)     -> ign-registry (bucket)
 //!                          +-> /healthz /readyz /metrics, gRPC health and reflection
 //!   tasks: reap lost leases · mirror what is published into the bucket · drop stale uploads
@@ -11,8 +11,10 @@
 //! **Architecture invariants.** The coordinator decides nothing by itself: every rule about jobs is the queue's, under a
 //! row lock of the database, so that any number of coordinators may run on one database and bucket, and any of them may
 //! be killed at any point. Nothing is kept in memory that a restart needs. Only [`publish`] makes a bundle visible, and
-//! only after the database accepted the attempt. Requests without a token reach nothing but the health checks.
+//! only after the database accepted the attempt. What a request needs stands in the table of
+//! [`access`] alone; what is not there does not exist.
 
+mod access;
 mod app;
 mod auth;
 mod bundles;
@@ -21,15 +23,21 @@ mod config;
 mod convert;
 mod data_plane;
 mod error;
+mod fetch;
 mod http_answer;
 mod jobs;
+mod limits;
 mod maintenance;
 mod metrics;
 mod operations;
 mod publish;
 mod server;
+mod throttle;
+mod token;
+mod tokens;
 mod trace;
 mod workers;
 
 pub use config::{Config, ServeError};
+pub use limits::{Limits, Rate};
 pub use server::{Running, serve};

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Parser, ValueEnum};
-use ign_coordinator::{Config, serve};
+use ign_coordinator::{Config, Limits, serve};
 use ign_queue::Settings;
 use ign_registry::StoreConfig;
 use tokio::signal::unix::{SignalKind, signal};
@@ -29,7 +29,7 @@ struct Args {
     /// file:///folder or s3://bucket/prefix.
     #[arg(long, env = "IGN_STORE")]
     store: String,
-    /// File with the bearer token that every client must show.
+    /// File with the root token, which allows everything; `ignctl token create` makes others.
     #[arg(long, env = "IGN_TOKEN_FILE")]
     token_file: PathBuf,
     /// Where to write url, pid and token file as JSON once listening.
@@ -100,6 +100,7 @@ async fn run(args: Args) -> anyhow::Result<()> {
             ..Settings::default()
         },
         redirect_blobs: args.redirect_blobs,
+        limits: Limits::default(),
     };
     let shutdown = async move {
         tokio::select! {

@@ -7,19 +7,29 @@ use axum::extract::State;
 use axum::http::StatusCode;
 use axum::http::header::CONTENT_TYPE;
 use axum::response::IntoResponse;
+use axum::routing::{MethodRouter, get};
 
 use crate::app::App;
 use crate::http_answer::Refused;
 
 const PATIENCE: Duration = Duration::from_secs(3);
 
+/// The routes of this module.
+pub(crate) fn routes() -> Vec<(&'static str, MethodRouter<Arc<App>>)> {
+    vec![
+        ("/healthz", get(healthz)),
+        ("/readyz", get(readyz)),
+        ("/metrics", get(metrics)),
+    ]
+}
+
 /// The process answers.
-pub(crate) async fn healthz() -> &'static str {
+async fn healthz() -> &'static str {
     "ok\n"
 }
 
 /// Database and object store answer, and the coordinator is not ending.
-pub(crate) async fn readyz(State(app): State<Arc<App>>) -> (StatusCode, &'static str) {
+async fn readyz(State(app): State<Arc<App>>) -> (StatusCode, &'static str) {
     let unready = |what| (StatusCode::SERVICE_UNAVAILABLE, what);
     if app.stopping.is_cancelled() {
         return unready("stopping\n");
@@ -38,7 +48,7 @@ pub(crate) async fn readyz(State(app): State<Arc<App>>) -> (StatusCode, &'static
 }
 
 /// Prometheus' text.
-pub(crate) async fn metrics(State(app): State<Arc<App>>) -> impl IntoResponse {
+async fn metrics(State(app): State<Arc<App>>) -> impl IntoResponse {
     let status = tokio::time::timeout(PATIENCE, app.store.status(None, 0)).await;
     let text = app
         .metrics

@@ -15,9 +15,7 @@ use axum::http::header::{
     AUTHORIZATION, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_NONE_MATCH, LOCATION,
     RANGE,
 };
-use axum::http::{HeaderMap, HeaderName, Method, StatusCode};
-use axum::response::{IntoResponse as _, Response};
-use axum::routing::get;
+use axum::http::{HeaderMap, HeaderName, Method};
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
 use hyper_util::server::graceful::GracefulShutdown;
@@ -25,8 +23,9 @@ use hyper_util::service::TowerToHyperService;
 use ign_proto::v1::bundles_server::BundlesServer;
 use ign_proto::v1::collections_server::CollectionsServer;
 use ign_proto::v1::jobs_server::JobsServer;
+use ign_proto::v1::tokens_server::TokensServer;
 use ign_proto::v1::workers_server::WorkersServer;
-use ign_proto::{Cause, MAX_MESSAGE_BYTES, v1};
+use ign_proto::{MAX_MESSAGE_BYTES, v1};
 use ign_registry::Registry;
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
@@ -37,17 +36,19 @@ use tower::ServiceExt as _;
 use tower_http::cors::{Any, CorsLayer};
 
 use crate::app::App;
-use crate::auth::{self, Peer, Token};
+use crate::auth::{self, Doorkeeper, Peer};
 use crate::bundles::BundlesApi;
 use crate::collections::CollectionsApi;
 use crate::config::{Config, ServeError};
 use crate::data_plane;
-use crate::http_answer::{is_grpc, oci_error};
+use crate::fetch::Contents;
+use crate::http_answer::unknown;
 use crate::jobs::JobsApi;
 use crate::maintenance;
 use crate::metrics::Metrics;
 use crate::operations;
 use crate::publish::Mirror;
+use crate::tokens::TokensApi;
 use crate::trace;
 use crate::workers::WorkersApi;
 
@@ -95,7 +96,7 @@ pub async fn serve(
     config: Config,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<Running, ServeError> {
-    let token = Token::read(&config.token_file)?;
+    let doorkeeper = Doorkeeper::new(&config.token_file, &config.limits, false)?;
     let registry = Registry::open(&config.store)
         .await
         .map_err(|source| ServeError::Registry { source })?;
@@ -121,7 +122,8 @@ pub async fn serve(
     let app = Arc::new(App {
         store,
         registry,
-        token,
+        doorkeeper,
+        contents: Contents::default(),
         metrics: Metrics::default(),
         mirror: Mirror::default(),
         redirect_blobs: config.redirect_blobs,
@@ -182,6 +184,9 @@ async fn router(app: &Arc<App>) -> (HealthReporter, Router) {
         .add_service(
             CollectionsServer::new(CollectionsApi(app.clone()))
                 .max_decoding_message_size(MAX_MESSAGE_BYTES),
+        )
+        .add_service(
+            TokensServer::new(TokensApi(app.clone())).max_decoding_message_size(MAX_MESSAGE_BYTES),
         );
     match tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
@@ -192,9 +197,11 @@ async fn router(app: &Arc<App>) -> (HealthReporter, Router) {
         Err(error) => tracing::error!(%error, "no reflection: the compiled schema is damaged"),
     }
     let http = data_plane::routes()
-        .route("/healthz", get(operations::healthz))
-        .route("/readyz", get(operations::readyz))
-        .route("/metrics", get(operations::metrics))
+        .into_iter()
+        .chain(operations::routes())
+        .fold(Router::new(), |router, (path, route)| {
+            router.route(path, route)
+        })
         .with_state(app.clone());
     let cors = CorsLayer::new()
         .allow_origin(Any)
@@ -211,7 +218,7 @@ async fn router(app: &Arc<App>) -> (HealthReporter, Router) {
         ]);
     let router = http
         .merge(services.into_axum_router())
-        .fallback(unknown)
+        .fallback(|headers: HeaderMap| async move { unknown(&headers) })
         .layer(axum::middleware::from_fn_with_state(
             app.clone(),
             auth::layer,
@@ -222,18 +229,6 @@ async fn router(app: &Arc<App>) -> (HealthReporter, Router) {
             trace::layer,
         ));
     (health, router)
-}
-
-async fn unknown(headers: HeaderMap) -> Response {
-    let message = "no such route";
-    if is_grpc(&headers) {
-        let cause = Cause::Transport {
-            code: tonic::Code::Unimplemented,
-            message: message.to_owned(),
-        };
-        return cause.status().into_http();
-    }
-    oci_error(StatusCode::NOT_FOUND, "UNSUPPORTED", message).into_response()
 }
 
 /// Takes connections until the coordinator is to stop, then lets them finish.
@@ -280,7 +275,10 @@ async fn accept(app: &App, listener: TcpListener, router: Router, health: &Healt
             continue;
         }
         let service = router.clone().map_request(move |mut request: Request<_>| {
-            request.extensions_mut().insert(Peer(peer));
+            request.extensions_mut().insert(Peer {
+                address: peer,
+                certificate: None,
+            });
             request
         });
         let connection = server

@@ -5,12 +5,14 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use ign_proto::v1::workers_server::Workers;
-use ign_proto::{Cause, Kind, Manifest, v1};
+use ign_proto::{Cause, JobId, Kind, Manifest, Scope, v1};
 use ign_queue::Checkpoint;
 use tokio::time::Instant;
 use tonic::{Request, Response, Status};
 
+use crate::access::Caller;
 use crate::app::App;
+use crate::auth::caller;
 use crate::convert::{
     failure, job_attempt, log_lines, parsed, progress, required, to_bundle, to_spec, worker_info,
 };
@@ -26,6 +28,18 @@ type Answer<T> = Result<Response<T>, Status>;
 pub(crate) struct WorkersApi(pub(crate) Arc<App>);
 
 impl WorkersApi {
+    /// Refuses unless the caller works for the job's collection; a job of another one does not exist for it.
+    async fn check(&self, caller: &Caller, job: JobId) -> Result<(), Refused> {
+        let reach = caller.reach(Scope::Publish);
+        if reach.only().is_some() {
+            let found = self.0.store.get(job).await?;
+            if !reach.contains(&found.spec.object.collection) {
+                return Err(Cause::absent("job", job).into());
+            }
+        }
+        Ok(())
+    }
+
     fn lease_secs(&self) -> f64 {
         self.0.store.settings().lease.as_secs_f64()
     }
@@ -34,6 +48,7 @@ impl WorkersApi {
 #[tonic::async_trait]
 impl Workers for WorkersApi {
     async fn lease(&self, request: Request<v1::LeaseRequest>) -> Answer<v1::LeaseResponse> {
+        let reach = caller(request.extensions())?.reach(Scope::Publish);
         let request = request.into_inner();
         let worker = worker_info(&request)?;
         let wait = Duration::try_from_secs_f64(request.wait_secs)
@@ -44,8 +59,8 @@ impl Workers for WorkersApi {
         loop {
             // In a task of its own: a client that leaves in the middle must not cut a claim in two.
             let claim = trace::spawn({
-                let (app, worker) = (self.0.clone(), worker.clone());
-                async move { app.store.lease(&worker).await }
+                let (app, worker, reach) = (self.0.clone(), worker.clone(), reach.clone());
+                async move { app.store.lease_within(&worker, reach.only()).await }
             });
             let job = claim
                 .await
@@ -80,8 +95,10 @@ impl Workers for WorkersApi {
         &self,
         request: Request<v1::HeartbeatRequest>,
     ) -> Answer<v1::HeartbeatResponse> {
+        let caller = caller(request.extensions())?;
         let request = request.into_inner();
         let (job, attempt) = job_attempt(request.job.as_ref())?;
+        self.check(&caller, job).await?;
         let (progress, logs) = (request.progress.map(progress), log_lines(request.logs));
         let orders = self
             .0
@@ -100,8 +117,10 @@ impl Workers for WorkersApi {
         &self,
         request: Request<v1::CheckpointRequest>,
     ) -> Answer<v1::CheckpointResponse> {
+        let caller = caller(request.extensions())?;
         let request = request.into_inner();
         let (job, attempt) = job_attempt(request.job.as_ref())?;
+        self.check(&caller, job).await?;
         let checkpoint = Checkpoint {
             digest: parsed(&request.digest, "digest")?,
             size_bytes: request.size_bytes,
@@ -132,8 +151,10 @@ impl Workers for WorkersApi {
         &self,
         request: Request<v1::CompleteRequest>,
     ) -> Answer<v1::CompleteResponse> {
+        let caller = caller(request.extensions())?;
         let request = request.into_inner();
         let (job, attempt) = job_attempt(request.job.as_ref())?;
+        self.check(&caller, job).await?;
         let manifest = Manifest::from_wire(Kind::Bundle, &request.files)
             .map_err(|error| Refused(Cause::bad_field("files", error)))?;
         // Not cut short by a client that leaves: the next call finds the outcome.
@@ -155,8 +176,10 @@ impl Workers for WorkersApi {
     }
 
     async fn fail(&self, request: Request<v1::FailRequest>) -> Answer<v1::FailResponse> {
+        let caller = caller(request.extensions())?;
         let request = request.into_inner();
         let (job, attempt) = job_attempt(request.job.as_ref())?;
+        self.check(&caller, job).await?;
         let failure = failure(required(request.failure, "failure")?)?;
         tracing::info!(job.id = %job, job.attempt = attempt.0, failure = failure.message, "attempt failed");
         let logs = log_lines(request.logs);

@@ -1,10 +1,13 @@
 //! What a store accepts: limits on texts and numbers, the same for both databases.
 
+use ign_proto::ObjectId;
+
 use crate::state::{DEFAULT_MAX_ATTEMPTS, Failure, Progress};
 use crate::store::{
     Collection, MAX_LOG_LINE_BYTES, MAX_RECIPE_BYTES, NewLogLine, NewVersion, Result, StoreError,
     Submit, WorkerInfo,
 };
+use crate::token::NewToken;
 
 const MAX_REQUEST_ID_BYTES: usize = 200;
 const MAX_LABELS: usize = 32;
@@ -12,6 +15,7 @@ const MAX_LABEL_BYTES: usize = 255;
 const MAX_ATTEMPTS: u32 = 100;
 const MAX_METRICS_BYTES: usize = 1024 * 1024;
 const MAX_ALIAS_BYTES: usize = 63;
+const MAX_GRANTS: usize = 100;
 
 fn invalid<T>(field: &'static str, message: impl Into<String>) -> Result<T> {
     Err(StoreError::Invalid {
@@ -107,6 +111,24 @@ pub(crate) fn alias(alias: &str) -> Result<()> {
     }
     if version_number(alias).is_some() {
         return invalid("alias", "looks like a version");
+    }
+    Ok(())
+}
+
+/// Ids are in upper case and names in lower case, so that neither is taken for the other.
+pub(crate) fn token(new: &NewToken) -> Result<()> {
+    let upper = |b: u8| b.is_ascii_uppercase() || b.is_ascii_digit();
+    if new.id.len() != 12 || !new.id.bytes().all(upper) {
+        return invalid("id", "must be 12 of A-Z 0-9");
+    }
+    if new.name.parse::<ObjectId>().is_err() || new.name.bytes().all(|b| b.is_ascii_digit()) {
+        return invalid(
+            "name",
+            "must be 1 to 63 of a-z 0-9 . _ -, starting with a letter or digit, not digits alone",
+        );
+    }
+    if new.grants.is_empty() || new.grants.len() > MAX_GRANTS {
+        return invalid("grants", format!("must be 1 to {MAX_GRANTS}"));
     }
     Ok(())
 }

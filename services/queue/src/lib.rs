@@ -3,6 +3,7 @@
 //! - [`state`]: the rules of a job's life, pure.
 //! - [`store`]: what a queue can do, as a trait with its types and errors.
 //! - [`changes`]: waiting for changes.
+//! - [`token`]: bearer tokens.
 //! - [`postgres`] and [`sqlite`]: the two databases; `sql` is the text they share.
 //!
 //! Invariant: nothing outside the state machine decides what becomes of a job; the stores only find, lock and keep.
@@ -16,6 +17,7 @@ pub mod postgres;
 pub mod sqlite;
 pub mod state;
 pub mod store;
+pub mod token;
 mod waiting;
 
 pub use changes::Changes;
@@ -26,6 +28,7 @@ pub use store::{
     Collection, JobFilter, JobPage, LogLine, NewLogLine, NewVersion, Orders, Reaped, Settings,
     Status, Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker, WorkerInfo,
 };
+pub use token::{NewToken, SecretHash, Token, TokenKey, Tokens};
 
 /// Opens the store that the URL names (`sqlite:///path/to/file` or `postgres://...`) and brings its schema up to date.
 pub async fn open(url: &str, settings: Settings) -> store::Result<Arc<dyn Store>> {

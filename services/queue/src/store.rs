@@ -5,7 +5,7 @@
 //!
 //! Invariant: no transaction is open between calls, let alone while a job runs.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -14,6 +14,7 @@ use ign_proto::{Attempt, CollectionId, Digest, JobId, ObjectId, ObjectName, Work
 
 use crate::changes::Changes;
 use crate::state::{Backoff, Checkpoint, Failure, Job, JobSpec, JobState, Level, Progress};
+use crate::token::Tokens;
 
 /// Lines kept of a job's log; older ones go.
 pub const MAX_LOG_LINES: u64 = 10_000;
@@ -306,7 +307,7 @@ pub struct Reaped {
 
 /// A durable queue of jobs with its registry of versions.
 #[async_trait]
-pub trait Store: Send + Sync + std::fmt::Debug + 'static {
+pub trait Store: Tokens + Send + Sync + std::fmt::Debug + 'static {
     /// The times it works with.
     fn settings(&self) -> Settings;
 
@@ -360,7 +361,16 @@ pub trait Store: Send + Sync + std::fmt::Debug + 'static {
 
     /// The next job for a worker: priority, then the collection with the fewest running jobs for its weight, then the
     /// one served longest ago, then age. None when there is nothing to do or the worker drains.
-    async fn lease(&self, worker: &WorkerInfo) -> Result<Option<Job>>;
+    async fn lease(&self, worker: &WorkerInfo) -> Result<Option<Job>> {
+        self.lease_within(worker, None).await
+    }
+
+    /// As [`Store::lease`], from these collections alone; none for all.
+    async fn lease_within(
+        &self,
+        worker: &WorkerInfo,
+        collections: Option<&BTreeSet<CollectionId>>,
+    ) -> Result<Option<Job>>;
 
     /// Extends the lease, keeps progress and log lines.
     async fn heartbeat(

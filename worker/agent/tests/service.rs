@@ -58,6 +58,7 @@ impl Service {
                 },
                 poll: Duration::from_millis(100),
             },
+            limits: ign_coordinator::Limits::default(),
             redirect_blobs: true,
         };
         let stop = CancellationToken::new();

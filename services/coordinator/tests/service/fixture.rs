@@ -5,10 +5,11 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use ign_coordinator::{Config, Running, serve};
+use ign_coordinator::{Config, Limits, Running, serve};
 use ign_proto::v1::bundles_client::BundlesClient;
 use ign_proto::v1::collections_client::CollectionsClient;
 use ign_proto::v1::jobs_client::JobsClient;
+use ign_proto::v1::tokens_client::TokensClient;
 use ign_proto::v1::workers_client::WorkersClient;
 use ign_proto::{Cause, Digest, FileEntry, Kind, Manifest, v1};
 use ign_queue::{Backoff, Settings};
@@ -45,6 +46,7 @@ pub(crate) struct Service {
     pub(crate) workers: WorkersClient<Authorized>,
     pub(crate) bundles: BundlesClient<Authorized>,
     pub(crate) collections: CollectionsClient<Authorized>,
+    pub(crate) tokens: TokensClient<Authorized>,
     pub(crate) http: reqwest::Client,
     pub(crate) folder: PathBuf,
     config: Config,
@@ -83,18 +85,26 @@ impl Service {
             endpoint_file: Some(folder.join("endpoint.json")),
             settings: settings(Duration::from_secs(45)),
             redirect_blobs: true,
+            limits: Limits::default(),
         };
         change(&mut config);
         let http = reqwest::Client::new();
         let (running, stop) = launch(&config).await;
         let url = running.url();
-        let (jobs, workers, bundles, collections) = clients(&url);
+        let Clients {
+            jobs,
+            workers,
+            bundles,
+            collections,
+            tokens,
+        } = Clients::new(&url, TOKEN);
         Self {
             url,
             jobs,
             workers,
             bundles,
             collections,
+            tokens,
             http,
             folder,
             config,
@@ -117,7 +127,13 @@ impl Service {
         }
         let (running, stop) = launch(&self.config).await;
         self.url = running.url();
-        (self.jobs, self.workers, self.bundles, self.collections) = clients(&self.url);
+        Clients {
+            jobs: self.jobs,
+            workers: self.workers,
+            bundles: self.bundles,
+            collections: self.collections,
+            tokens: self.tokens,
+        } = Clients::new(&self.url, TOKEN);
         self.running = Some((running, stop));
     }
 
@@ -126,6 +142,49 @@ impl Service {
         self.http
             .request(method, format!("{}{path}", self.url))
             .bearer_auth(TOKEN)
+    }
+
+    /// A token that allows `grants`.
+    pub(crate) async fn token(&mut self, grants: &[&str]) -> String {
+        self.token_for(grants, 0.0).await
+    }
+
+    /// The same, for so long.
+    pub(crate) async fn token_for(&mut self, grants: &[&str], valid_secs: f64) -> String {
+        let request = v1::CreateTokenRequest {
+            name: format!("t{}", uuid::Uuid::new_v4().simple()),
+            grants: grants.iter().map(ToString::to_string).collect(),
+            valid_secs,
+        };
+        self.tokens
+            .create(request)
+            .await
+            .unwrap()
+            .into_inner()
+            .secret
+    }
+
+    /// Its next secret; the one until now is good for `grace_secs`.
+    pub(crate) async fn rotate(&mut self, secret: &str, grace_secs: f64) -> String {
+        let request = v1::RotateTokenRequest {
+            token: token_id(secret).to_owned(),
+            grace_secs,
+            valid_secs: 0.0,
+        };
+        self.tokens
+            .rotate(request)
+            .await
+            .unwrap()
+            .into_inner()
+            .secret
+    }
+
+    pub(crate) async fn revoke(&mut self, secret: &str) {
+        let token = token_id(secret).to_owned();
+        self.tokens
+            .revoke(v1::RevokeTokenRequest { token })
+            .await
+            .unwrap();
     }
 
     pub(crate) async fn upload(&self, object: &str, bytes: &[u8]) -> Digest {
@@ -231,6 +290,10 @@ impl Service {
     }
 }
 
+fn token_id(secret: &str) -> &str {
+    secret.split('_').nth(1).unwrap()
+}
+
 async fn launch(config: &Config) -> (Running, oneshot::Sender<()>) {
     let (stop, stopped) = oneshot::channel();
     let shutdown = async move {
@@ -240,22 +303,28 @@ async fn launch(config: &Config) -> (Running, oneshot::Sender<()>) {
     (serve(config.clone(), shutdown).await.unwrap(), stop)
 }
 
-type Clients = (
-    JobsClient<Authorized>,
-    WorkersClient<Authorized>,
-    BundlesClient<Authorized>,
-    CollectionsClient<Authorized>,
-);
+/// Clients of every service, with one token.
+pub(crate) struct Clients {
+    pub(crate) jobs: JobsClient<Authorized>,
+    pub(crate) workers: WorkersClient<Authorized>,
+    pub(crate) bundles: BundlesClient<Authorized>,
+    pub(crate) collections: CollectionsClient<Authorized>,
+    pub(crate) tokens: TokensClient<Authorized>,
+}
 
-fn clients(url: &str) -> Clients {
-    let channel = Channel::from_shared(url.to_owned()).unwrap().connect_lazy();
-    let bearer = Bearer(format!("Bearer {TOKEN}").parse().unwrap());
-    (
-        JobsClient::with_interceptor(channel.clone(), bearer.clone()),
-        WorkersClient::with_interceptor(channel.clone(), bearer.clone()),
-        BundlesClient::with_interceptor(channel.clone(), bearer.clone()),
-        CollectionsClient::with_interceptor(channel, bearer),
-    )
+impl Clients {
+    pub(crate) fn new(url: &str, token: &str) -> Self {
+        let channel = Channel::from_shared(url.to_owned()).unwrap().connect_lazy();
+        let bearer = Bearer(format!("Bearer {token}").parse().unwrap());
+        let authorized = InterceptedService::new(channel, bearer);
+        Self {
+            jobs: JobsClient::new(authorized.clone()),
+            workers: WorkersClient::new(authorized.clone()),
+            bundles: BundlesClient::new(authorized.clone()),
+            collections: CollectionsClient::new(authorized.clone()),
+            tokens: TokensClient::new(authorized),
+        }
+    }
 }
 
 pub(crate) fn manifest(kind: Kind, files: &[(&str, &[u8])]) -> Manifest {

@@ -120,6 +120,7 @@ async fn a_coordinator_that_cannot_work_says_why() {
             token_file: token.clone(),
             endpoint_file: None,
             settings: ign_queue::Settings::default(),
+            limits: ign_coordinator::Limits::default(),
             redirect_blobs: false,
         };
         change(&mut config);

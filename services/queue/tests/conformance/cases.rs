@@ -10,6 +10,10 @@ use ign_queue::{
     NewVersion, Progress, Settings, StoreError, Submit, VersionFilter,
 };
 
+pub(crate) use crate::tokens::{
+    tokens_rotate_expire_and_end, workers_stay_within_their_collections,
+};
+
 use crate::bench::{
     Bench, PATIENT, after, bundle, digest, failure, kind, name, request, spec, worker,
 };

@@ -9,6 +9,7 @@ mod cases;
 mod migrations;
 mod model;
 mod postgres_only;
+mod tokens;
 
 macro_rules! conformance {
     ($($case:ident),* $(,)?) => {
@@ -54,7 +55,9 @@ conformance![
     stale_attempts_change_nothing,
     status_shows_one_screen,
     submits_are_idempotent,
+    tokens_rotate_expire_and_end,
     waiting_jobs_say_why,
     weights_share_the_workers,
+    workers_stay_within_their_collections,
     worthless_requests_are_refused,
 ];
