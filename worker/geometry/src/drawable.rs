@@ -44,7 +44,7 @@ pub(crate) struct Cluster {
     /// Positions in world axes, finite.
     pub(crate) positions: Vec<DVec3>,
     /// Normals of the vertices, as the mesh has them; zero where it has none.
-    normals: Vec<DVec3>,
+    pub(crate) normals: Vec<DVec3>,
     /// A box around `positions`.
     pub(crate) bounds: Bounds,
 }
@@ -120,15 +120,12 @@ impl Drawable {
         self.bounds
     }
 
-    /// Positions and normals of the corners of a triangle that was drawn.
-    pub(crate) fn corners(&self, triangle: u32) -> ([DVec3; 3], [DVec3; 3]) {
+    /// Where a triangle that was drawn is kept: its cluster, and the vertices of its corners there.
+    #[inline]
+    pub(crate) fn corners(&self, triangle: u32) -> (&Cluster, [usize; 3]) {
         let slot = self.slots[triangle as usize] as usize;
         let cluster = &self.clusters[slot / TRIANGLES];
-        let corners = cluster.corners[slot % TRIANGLES].map(usize::from);
-        (
-            corners.map(|corner| cluster.positions[corner]),
-            corners.map(|corner| cluster.normals[corner]),
-        )
+        (cluster, cluster.corners[slot % TRIANGLES].map(usize::from))
     }
 }
 

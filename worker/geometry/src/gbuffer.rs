@@ -193,7 +193,8 @@ fn samples_by_distance(samples: usize) -> Vec<(usize, usize)> {
 fn attributes(view: &View<'_>, triangle: u32, px: DVec2, eye: DVec3) -> Option<Attributes> {
     let surface = view.surface(triangle, px)?;
     let weights = surface.weights;
-    let [a, b, c] = surface.positions;
+    let (cluster, corners) = (surface.cluster, surface.corners);
+    let [a, b, c] = corners.map(|corner| cluster.positions[corner]);
     let position = a * weights[0] + b * weights[1] + c * weights[2];
     if !position.as_vec3().is_finite() {
         return None;
@@ -203,11 +204,11 @@ fn attributes(view: &View<'_>, triangle: u32, px: DVec2, eye: DVec3) -> Option<A
     let face = if face.dot(view) > 0.0 { -face } else { face };
     // The side is the face's, at each corner by itself: a vertex of triangles with mixed winding points anywhere, and an
     // interpolated normal alone would flip in the middle of a silhouette's triangle.
-    let normal = surface
-        .normals
+    let normal = corners
         .iter()
         .zip(weights)
-        .map(|(normal, weight)| {
+        .map(|(corner, weight)| {
+            let normal = cluster.normals[*corner];
             let side = if normal.dot(face) < 0.0 { -1.0 } else { 1.0 };
             normal * side * weight
         })

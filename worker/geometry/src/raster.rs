@@ -132,15 +132,15 @@ fn weights([a, b, c]: [DVec3; 3], ray: DVec3) -> Option<[f64; 3]> {
 }
 
 /// Where the ray through an image point meets a triangle.
-pub(crate) struct Surface {
+pub(crate) struct Surface<'a> {
     /// Weights of the triangle's corners.
     pub(crate) weights: [f64; 3],
     /// Camera z.
     pub(crate) depth: f64,
-    /// The corners in world axes.
-    pub(crate) positions: [DVec3; 3],
-    /// The corners' normals.
-    pub(crate) normals: [DVec3; 3],
+    /// What holds the triangle.
+    pub(crate) cluster: &'a Cluster,
+    /// The corners' vertices in `cluster`.
+    pub(crate) corners: [usize; 3],
 }
 
 /// The nearest triangle at each sample of a band.
@@ -409,17 +409,17 @@ impl<'a> View<'a> {
     /// Where the ray through `px` meets a triangle that was drawn; `None` when that is seen edge-on, up to rounding, or
     /// so far or near that f32 cannot hold its depth.
     #[inline]
-    pub(crate) fn surface(&self, triangle: u32, px: DVec2) -> Option<Surface> {
-        let (positions, normals) = self.drawable.corners(triangle);
-        let points = positions.map(|position| self.point(position));
+    pub(crate) fn surface(&self, triangle: u32, px: DVec2) -> Option<Surface<'a>> {
+        let (cluster, corners) = self.drawable.corners(triangle);
+        let points = corners.map(|corner| self.point(cluster.positions[corner]));
         let weights = weights(points, self.camera.intrinsics.ray(px))?;
         let depths = weights.iter().zip(&points);
         let depth: f64 = depths.map(|(weight, point)| weight * point.z).sum();
         (depth as f32 > 0.0 && (depth as f32).is_finite()).then_some(Surface {
             weights,
             depth,
-            positions,
-            normals,
+            cluster,
+            corners,
         })
     }
 
