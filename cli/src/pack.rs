@@ -1,7 +1,8 @@
 //! A capture folder as files with digests and one manifest: what `ignctl` uploads.
 //!
 //! The list of files is the capture contract of DESIGN section 5: `images/`, `sparse/`, `masks/`, `mesh.*`,
-//! `test.txt`, `capture.toml`, and another mesh only when it is the proxy. Faults of the content are not judged
+//! `test.txt`, `capture.toml`, another format's files of cameras with what they name, and another mesh only when it is
+//! the proxy. Faults of the content are not judged
 //! here: the worker's preflight does that for every way a capture may come in.
 //! Invariant: the manifest depends on paths and contents alone, so the same capture has the same digest on every
 //! machine and is never stored or sent twice.
@@ -143,6 +144,9 @@ pub(crate) fn list(capture: &Path, proxy: Option<&Path>) -> Result<Vec<SourceFil
         if path.is_file() {
             files.push(source_file(capture, &path)?);
         }
+    }
+    for path in ign_capture::camera_files(capture) {
+        files.push(source_file(capture, &capture.join(path))?);
     }
     if let Some(proxy) = proxy {
         files.push(SourceFile {
@@ -299,6 +303,9 @@ fn media_type(path: &str) -> &'static str {
         "obj" => "model/obj",
         "txt" => "text/plain",
         "toml" => "application/toml",
+        "json" => "application/json",
+        "xml" => "application/xml",
+        "csv" => "text/csv",
         _ => "application/octet-stream",
     }
 }
@@ -377,6 +384,48 @@ mod tests {
         );
         let missing = find_proxy(dir.path(), Path::new("none.ply")).unwrap_err();
         assert_eq!(missing.exit, crate::problem::Exit::Usage);
+    }
+
+    #[test]
+    fn files_of_cameras_come_along_by_what_is_in_them() {
+        let dir = capture();
+        let write = |path: &str, text: &str| {
+            let path = dir.path().join(path);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, text).unwrap();
+        };
+        let before = list(dir.path(), None).unwrap();
+        write("inventory.csv", "object,price\nvase,100\n");
+        write("notes.json", "{\"a\": 1}");
+        write("notes.xml", "<html/>");
+        assert_eq!(list(dir.path(), None).unwrap(), before);
+        write("scan.csv", "#name,x,y,alt,heading,pitch,roll,f\n");
+        write("bundle/bundle.out", "# Bundle file v0.3\n0 0\n");
+        write("list.txt", "");
+        write(
+            "transforms.json",
+            "{\"ply_file_path\": \"points.ply\", \"frames\": []}",
+        );
+        write("points.ply", "ply");
+        write("other/images.bin", "");
+        write("capture.toml", "reconstruction = \"other\"\n");
+        let files = list(dir.path(), None).unwrap();
+        let added: Vec<&str> = paths(&files)
+            .into_iter()
+            .filter(|path| !paths(&before).contains(path))
+            .collect();
+        assert_eq!(
+            added,
+            [
+                "bundle/bundle.out",
+                "capture.toml",
+                "list.txt",
+                "other/images.bin",
+                "points.ply",
+                "scan.csv",
+                "transforms.json"
+            ]
+        );
     }
 
     #[test]

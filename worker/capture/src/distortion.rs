@@ -17,7 +17,7 @@
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// Camera models of COLMAP that can be imported.
+/// Camera models that can be imported: COLMAP's, and the two that all other programs' come down to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum CameraModel {
@@ -57,6 +57,10 @@ pub enum CameraModel {
     Eucm,
     /// width, height
     Equirectangular,
+    /// Pinhole with radial, tangential and prism terms and skew, as [`Brown`] has them; not a model of COLMAP.
+    Brown,
+    /// The same on angles to the axis; not a model of COLMAP.
+    BrownFisheye,
 }
 
 /// One row of COLMAP's model table: number in binary files, name in text files, number of parameters.
@@ -190,6 +194,53 @@ pub struct SourceCamera {
     pub(crate) lens: Lens,
 }
 
+/// A camera of the polynomial family with any of its terms, in pixels: what other programs than COLMAP write.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Brown {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    pub(crate) fx: f64,
+    pub(crate) fy: f64,
+    pub(crate) cx: f64,
+    pub(crate) cy: f64,
+    pub(crate) skew: f64,
+    /// Radii are angles to the axis.
+    pub(crate) fisheye: bool,
+    /// k1..k6, of the even powers of the radius.
+    pub(crate) radial: [f64; 6],
+    /// p1, p2 in `OpenCV`'s order: p1 bends y more, p2 bends x more.
+    pub(crate) tangential: [f64; 2],
+    /// Thin prism: x by the radius squared and to the fourth, y by the same.
+    pub(crate) prism: [f64; 4],
+}
+
+impl From<Brown> for SourceCamera {
+    fn from(brown: Brown) -> Self {
+        let bend = Polynomial {
+            fisheye: brown.fisheye,
+            radial: brown.radial,
+            tangential: brown.tangential,
+            prism: brown.prism,
+            ..Polynomial::NONE
+        };
+        Self {
+            model: if brown.fisheye {
+                CameraModel::BrownFisheye
+            } else {
+                CameraModel::Brown
+            },
+            width: brown.width,
+            height: brown.height,
+            fx: brown.fx,
+            fy: brown.fy,
+            cx: brown.cx,
+            cy: brown.cy,
+            skew: brown.skew,
+            lens: Lens::Polynomial(bend.limited()),
+        }
+    }
+}
+
 /// Largest ray radius (tangent of the angle to the axis) that the scan for folding looks at.
 const RADIUS_SCANNED: f64 = 20.0;
 
@@ -312,6 +363,22 @@ impl SourceCamera {
             Some("has a distortion parameter that is not a finite number".into())
         } else {
             None
+        }
+    }
+
+    /// A panorama of the whole sphere.
+    pub(crate) fn panorama(width: u32, height: u32) -> Self {
+        let (w, h) = (f64::from(width), f64::from(height));
+        Self {
+            model: CameraModel::Equirectangular,
+            width,
+            height,
+            fx: w / std::f64::consts::TAU,
+            fy: h / std::f64::consts::PI,
+            cx: w / 2.0,
+            cy: h / 2.0,
+            skew: 0.0,
+            lens: Lens::Equirectangular,
         }
     }
 

@@ -33,7 +33,7 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     let mesh = proxy
         .as_ref()
         .and_then(|proxy| load_proxy(dir, proxy, &mut faults));
-    let model = reconstruction::read(dir, &mut faults);
+    let model = reconstruction::read(dir, &settings, &mut faults);
     let registered = check_names(&model, &mut faults);
     // Of a model that was read in part, what seems to be missing in it tells nothing.
     let model_is_whole = model.has_all_images && registered.len() == model.images.len();
@@ -111,7 +111,7 @@ fn check_folder(dir: &Path, faults: &mut Faults) -> bool {
             faults.error(
                 format!("cannot read the capture folder: {error}"),
                 at,
-                "name a folder with images/, sparse/ and a mesh",
+                "name a folder with images/, a reconstruction and a mesh",
             );
             false
         }
@@ -121,7 +121,7 @@ fn check_folder(dir: &Path, faults: &mut Faults) -> bool {
                 faults.error(
                     "the capture folder is empty",
                     at,
-                    "it must hold images/, a COLMAP model in sparse/0/ and the proxy mesh.ply",
+                    "it must hold images/, a reconstruction (a COLMAP model in sparse/0/ or another format's file) and the proxy mesh.ply",
                 );
             }
             !empty

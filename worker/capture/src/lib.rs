@@ -1,4 +1,4 @@
-//! Import of captures: a folder of photographs, a COLMAP model and a proxy mesh becomes a [`Scene`].
+//! Import of captures: a folder of photographs, a reconstruction and a proxy mesh becomes a [`Scene`].
 //!
 //! [`import`] is the preflight as well: it looks at everything once and returns every fault it found, each with the
 //! file and line (or byte, or view) and a hint how to mend it. After it succeeded, [`Scene::frame_camera`] says which
@@ -28,5 +28,6 @@ pub use distortion::{CameraModel, SourceCamera};
 pub use fault::{Fault, ImportError, Severity};
 pub use frame::Frame;
 pub use import::{ImportOptions, import};
+pub use reconstruction::{Format, camera_files, check_cameras};
 pub use resample::ViewImage;
 pub use scene::{Background, CaptureInfo, Point, Scene, View};

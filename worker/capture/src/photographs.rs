@@ -76,8 +76,10 @@ pub(crate) fn check_photographs(
     }
     let masks = dir.join("masks");
     let mask_folder = masks.is_dir();
-    let has_masks =
+    let folder_has_masks =
         mask_folder && std::fs::read_dir(&masks).is_ok_and(|mut entries| entries.next().is_some());
+    // Some reconstructions name masks themselves.
+    let has_masks = folder_has_masks || registered.iter().any(|image| image.mask_path.is_some());
     if mask_folder && !has_masks {
         faults.warning(
             "the folder masks/ is empty",
@@ -120,7 +122,7 @@ pub(crate) fn report_unregistered(images: &Path, registered: &[&ModelImage], fau
                 extra.len()
             ),
             "images/",
-            "nothing to do, unless COLMAP should have registered them",
+            "nothing to do, unless they should have been registered",
         );
     }
 }
@@ -161,7 +163,10 @@ fn check_view(
         );
     let mut mask_path = None;
     if has_masks {
-        mask_path = photo::find_mask(&dir.join("masks"), &image.name);
+        mask_path = match &image.mask_path {
+            Some(named) => Some(dir.join(named)),
+            None => photo::find_mask(&dir.join("masks"), &image.name),
+        };
         match &mask_path {
             Some(path) => {
                 let shown = path.strip_prefix(dir).unwrap_or(path).display().to_string();
@@ -240,7 +245,7 @@ fn check_picture(
                     found.0, found.1, image.camera_id, size.0, size.1
                 ),
                 shown,
-                "use the pictures that COLMAP was run on, at their full size",
+                "use the pictures that the reconstruction was made from, at their full size",
             );
             false
         }

@@ -52,7 +52,7 @@ pub(crate) fn find_proxy(
         faults.error(
             "the proxy mesh is missing",
             PROXY_NAMES[0],
-            "put the proxy there as mesh.ply or mesh.obj, in the frame of the COLMAP model, or name it in capture.toml",
+            "put the proxy there as mesh.ply or mesh.obj, in the frame of the reconstruction, or name it in capture.toml",
         );
     }
     found

@@ -17,7 +17,7 @@ pub struct Scene {
     pub name: String,
     /// What the capture says about itself.
     pub info: CaptureInfo,
-    /// The proxy, in the frame of the COLMAP model ("world").
+    /// The proxy, in the frame of the reconstruction ("world").
     pub mesh: Mesh,
     /// All views that see the proxy, in path order.
     pub views: Vec<View>,
@@ -82,9 +82,9 @@ pub struct Point {
     pub position: DVec3,
     /// 8-bit sRGB.
     pub color: [u8; 3],
-    /// Mean reprojection error in pixels of the photographs.
-    pub error_px: f64,
-    /// Indices of the views that saw it, ascending.
+    /// Mean reprojection error in pixels of the photographs, where the reconstruction tells.
+    pub error_px: Option<f64>,
+    /// Indices of the views that saw it, ascending; empty where the reconstruction keeps no tracks.
     pub views: Vec<usize>,
 }
 

@@ -6,6 +6,7 @@
 //! licence = "CC BY 4.0"
 //! rights = "The Museum"
 //! proxy = "scan/mesh.ply"           # a file in the capture
+//! reconstruction = "cameras.xml"    # a file in the capture, or a folder with a COLMAP model
 //! masks = "white_is_object"         # or "white_is_background"
 //! metres_per_scene_unit = 0.12
 //! held_out = ["IMG_0007.jpg"]       # as test.txt
@@ -24,7 +25,8 @@ use crate::fault::Faults;
 /// Name of the file in the capture folder.
 pub(crate) const FILE_NAME: &str = "capture.toml";
 
-const KEYS: &str = "object, title, licence, rights, proxy, masks, metres_per_scene_unit, held_out";
+const KEYS: &str =
+    "object, title, licence, rights, proxy, reconstruction, masks, metres_per_scene_unit, held_out";
 
 /// The file's content; the default is what holds without the file.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -34,6 +36,7 @@ pub(crate) struct Settings {
     pub(crate) licence: Option<String>,
     pub(crate) rights: Option<String>,
     pub(crate) proxy: Option<(PathBuf, usize)>,
+    pub(crate) reconstruction: Option<(PathBuf, usize)>,
     pub(crate) mask_is_background: bool,
     pub(crate) metres_per_scene_unit: Option<f64>,
     /// Names with their line.
@@ -116,6 +119,15 @@ fn parse(text: &str, faults: &mut Faults) -> Settings {
                     "for example proxy = \"mesh.ply\"",
                 ),
             },
+            "reconstruction" => match text_of(&value).map(PathBuf::from) {
+                Some(path) if is_inside(&path) => {
+                    settings.reconstruction = Some((path, value_line));
+                }
+                _ => wrong(
+                    "must be the path of a file or folder inside the capture",
+                    "for example reconstruction = \"cameras.xml\"",
+                ),
+            },
             "masks" => match text_of(&value).as_deref() {
                 Some("white_is_object") => settings.mask_is_background = false,
                 Some("white_is_background") => settings.mask_is_background = true,
@@ -180,7 +192,8 @@ mod tests {
     #[test]
     fn every_key_is_read() {
         let text = "object = 'a/b'\ntitle = \"T\"\nlicence = 'L'\nrights = 'R'\nproxy = 'x/m.ply'\n\
-                    masks = 'white_is_background'\nmetres_per_scene_unit = 1_0\nheld_out = ['1.png',\n'2.png']\n";
+                    masks = 'white_is_background'\nmetres_per_scene_unit = 1_0\nheld_out = ['1.png',\n'2.png']\n\
+                    reconstruction = 'sparse/3'\n";
         let mut faults = Faults::default();
         let settings = parse(text, &mut faults);
         assert!(faults.into_list().is_empty());
@@ -192,6 +205,7 @@ mod tests {
                 licence: Some("L".into()),
                 rights: Some("R".into()),
                 proxy: Some(("x/m.ply".into(), 5)),
+                reconstruction: Some(("sparse/3".into(), 10)),
                 mask_is_background: true,
                 metres_per_scene_unit: Some(10.0),
                 held_out: Some(vec![("1.png".into(), 8), ("2.png".into(), 9)]),

@@ -86,7 +86,7 @@ pub(crate) fn keep_those_that_see(
             proxy
                 .map(|path| path.display().to_string())
                 .unwrap_or_default(),
-            "the mesh must be in the frame of the COLMAP model: same origin, axes and scale",
+            "the mesh must be in the frame of the reconstruction: same origin, axes and scale",
         );
     } else {
         faults.extend(blind.into_list());

@@ -117,7 +117,7 @@ pub(crate) fn held_out_names(
             faults.warning(
                 format!("held-out view {name} is not in the model and is left out"),
                 at,
-                "COLMAP did not register this photograph",
+                "the reconstruction did not register this photograph",
             );
         } else {
             let alike = known

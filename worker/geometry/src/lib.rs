@@ -20,7 +20,7 @@ mod warp;
 pub use camera::{Camera, CameraError, CameraIntrinsics, Projection, Similarity};
 pub use coverage::coverage_map;
 pub use drawable::Drawable;
-pub use formats::read_mesh;
+pub use formats::{parse_points, read_mesh};
 pub use gbuffer::GBuffer;
 pub use mesh::{Mesh, MeshError};
 pub use raster::{NO_TRIANGLE, Raster, barycentric, rasterize};

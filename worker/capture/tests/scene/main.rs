@@ -1,5 +1,6 @@
 //! Captures on disk through the public interface: preflight and loading of views.
 
 mod common;
+mod formats;
 mod loading;
 mod preflight;

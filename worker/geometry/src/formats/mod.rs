@@ -2,10 +2,13 @@
 
 mod obj;
 mod ply;
+mod points;
 
 use std::path::Path;
 
 use glam::DVec3;
+
+pub use points::parse_points;
 
 use crate::{Mesh, MeshError};
 

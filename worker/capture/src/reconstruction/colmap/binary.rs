@@ -5,16 +5,20 @@
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
+use std::path::Path;
 
 use glam::DVec3;
 
-use super::{REEXPORT_HINT, Source, pose};
+use super::{REEXPORT_HINT, Source, known_error, pose};
 use crate::distortion::{ModelKind, SourceCamera};
 use crate::fault::Faults;
 use crate::reconstruction::{Model, ModelImage, ModelPoint, add_camera};
 
 /// Longest name of a photograph that is believed.
 const NAME_BYTES: usize = 4096;
+
+/// An image takes at least this much: id, pose, camera, an empty name, no points.
+const IMAGE_BYTES: u64 = 4 + 56 + 4 + 1 + 8;
 
 /// Why reading stopped.
 enum Stop {
@@ -239,7 +243,7 @@ fn read_images(
     model: &mut Model,
     faults: &mut Faults,
 ) -> Result<(), Stop> {
-    for _ in 0..bytes.count(4 + 56 + 4 + 1 + 8)? {
+    for _ in 0..bytes.count(IMAGE_BYTES)? {
         bytes.begin_record();
         let id = bytes.u32()?;
         let values = bytes.f64s::<7>()?;
@@ -254,6 +258,7 @@ fn read_images(
                 name,
                 camera_id,
                 camera_from_world,
+                mask_path: None,
                 at,
             }),
             Err(message) => {
@@ -294,7 +299,7 @@ fn read_points(
             model.points.push(ModelPoint {
                 position,
                 color,
-                error_px,
+                error_px: known_error(error_px),
                 image_ids,
             });
         } else {
@@ -303,4 +308,16 @@ fn read_points(
         }
     }
     Ok(())
+}
+
+/// How many images the file says that it lists, and can.
+pub(super) fn count_images(path: &Path) -> u64 {
+    let count = || -> io::Result<u64> {
+        let mut file = File::open(path)?;
+        let length = file.metadata()?.len();
+        let mut count = [0; 8];
+        file.read_exact(&mut count)?;
+        Ok(u64::from_le_bytes(count).min(length / IMAGE_BYTES))
+    };
+    count().unwrap_or(0)
 }

@@ -2,8 +2,8 @@
 //!
 //! COLMAP's poses are world-to-camera with the quaternion as (w, x, y, z), camera axes x right, y down, z forward, and
 //! pixels with the centre of the top-left one at (0.5, 0.5): our own conventions, so that only the order of the
-//! quaternion's parts changes here. `rigs` and `frames` files of recent versions repeat what `images` says; they
-//! are not read. Source: COLMAP documentation, "Output Format".
+//! quaternion's parts changes here. Recent versions write `rigs` and `frames` beside them; the poses in `images` are
+//! composed from those already, so they are not read. `RealityCapture` exports models in this layout too. Source: COLMAP documentation, "Output Format".
 
 mod binary;
 mod text;
@@ -13,50 +13,123 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DQuat, DVec3};
 
 use crate::fault::Faults;
-use crate::reconstruction::Model;
+use crate::reconstruction::{FORMATS_HINT, Model};
 
-/// The folder of the model inside the capture: `sparse/0` or `sparse`.
-pub(crate) fn locate(dir: &Path, faults: &mut Faults) -> Option<PathBuf> {
-    let holds_model = |folder: &Path| {
-        ["cameras.bin", "cameras.txt", "images.bin", "images.txt"]
+/// Where a capture has its models: in this folder, or in numbered ones below it.
+pub(super) const FOLDER: &str = "sparse";
+
+/// Files of a model; the first four make a folder one.
+const FILES: [&str; 10] = [
+    "cameras.bin",
+    "cameras.txt",
+    "images.bin",
+    "images.txt",
+    "points3D.bin",
+    "points3D.txt",
+    "rigs.bin",
+    "rigs.txt",
+    "frames.bin",
+    "frames.txt",
+];
+
+/// Whether there is a model in `dir/folder`, or in numbered folders below it.
+pub(super) fn is_there(dir: &Path, folder: &Path) -> bool {
+    !models(dir, folder).is_empty()
+}
+
+/// The files of the model in `dir/relative`, from `dir`.
+pub(super) fn files(dir: &Path, relative: &Path) -> Vec<PathBuf> {
+    FILES
+        .iter()
+        .map(|name| relative.join(name))
+        .filter(|path| dir.join(path).is_file())
+        .collect()
+}
+
+/// The folders of models, from `dir`, the numbered ones first.
+fn models(dir: &Path, folder: &Path) -> Vec<PathBuf> {
+    let holds_model = |relative: &PathBuf| {
+        FILES[..4]
             .iter()
-            .any(|name| folder.join(name).is_file())
+            .any(|name| dir.join(relative).join(name).is_file())
     };
-    for relative in ["sparse/0", "sparse"] {
-        if holds_model(&dir.join(relative)) {
-            if relative == "sparse/0" && holds_model(&dir.join("sparse/1")) {
-                faults.warning(
-                    "the reconstruction fell into several models; only the first is used",
-                    "sparse/1",
-                    "merge the models, or check that the missing photographs are not needed",
-                );
-            }
-            return Some(PathBuf::from(relative));
+    let mut numbers: Vec<u64> = std::fs::read_dir(dir.join(folder))
+        .into_iter()
+        .flatten()
+        .filter_map(Result::ok)
+        .filter_map(|entry| entry.file_name().to_str()?.parse().ok())
+        .collect();
+    numbers.sort_unstable();
+    numbers
+        .into_iter()
+        .map(|number| folder.join(number.to_string()))
+        .chain([folder.to_owned()])
+        .filter(holds_model)
+        .collect()
+}
+
+/// The model with the most images in `dir/folder` or in a numbered folder below it; of equals, the first.
+pub(super) fn locate(dir: &Path, folder: &Path, faults: &mut Faults) -> Option<PathBuf> {
+    let mut counted: Vec<(u64, PathBuf)> = models(dir, folder)
+        .into_iter()
+        .map(|relative| (count_images(dir, &relative), relative))
+        .collect();
+    counted.sort_by_key(|(images, _)| std::cmp::Reverse(*images));
+    match counted.as_slice() {
+        [] if dir.join(folder).is_dir() => faults.error(
+            "there is no COLMAP model in the capture",
+            folder.join("0").display().to_string(),
+            "put cameras, images and points3D (.bin or .txt) there",
+        ),
+        [] => faults.error(
+            format!(
+                "the capture has no reconstruction: the folder {}/ is missing, and no other format was found",
+                folder.display()
+            ),
+            format!("{}/", folder.display()),
+            FORMATS_HINT,
+        ),
+        [_] => {}
+        [(images, taken), others @ ..] => {
+            let others: Vec<String> = others
+                .iter()
+                .map(|(images, other)| format!("{} ({images} images)", other.display()))
+                .collect();
+            faults.warning(
+                format!(
+                    "the reconstruction fell into {} models; {} with {images} images is used, left out: {}",
+                    counted.len(),
+                    taken.display(),
+                    others.join(", ")
+                ),
+                taken.display().to_string(),
+                "merge the models, or check that the missing photographs are not needed",
+            );
         }
     }
-    if dir.join("sparse").is_dir() {
-        faults.error(
-            "there is no COLMAP model in the capture",
-            "sparse/0",
-            "put cameras, images and points3D (.bin or .txt) there",
-        );
+    counted.into_iter().next().map(|(_, relative)| relative)
+}
+
+/// How many images a model says that it has; it is read in full only when it is the one to take.
+fn count_images(dir: &Path, relative: &Path) -> u64 {
+    let folder = dir.join(relative);
+    if is_binary(&folder) {
+        binary::count_images(&folder.join("images.bin"))
     } else {
-        faults.error(
-            "the folder sparse/ is missing",
-            "sparse/",
-            "put COLMAP's sparse model into sparse/0: cameras, images and points3D (.bin or .txt)",
-        );
+        text::count_images(&folder.join("images.txt"))
     }
-    None
+}
+
+/// COLMAP prefers binary when both are there; the two files that matter decide for all.
+fn is_binary(folder: &Path) -> bool {
+    let has = |name: &str| folder.join(name).is_file();
+    (has("cameras.bin") && has("images.bin")) || !(has("cameras.txt") || has("images.txt"))
 }
 
 /// Reads the model in `dir/relative`. Everything wrong with it goes into `faults`.
 pub(crate) fn read(dir: &Path, relative: &Path, faults: &mut Faults) -> Model {
     let mut model = Model::default();
-    // COLMAP prefers binary when both are there; the two files that matter decide for all.
-    let has = |name: &str| dir.join(relative).join(name).is_file();
-    let is_binary = has("cameras.bin") && has("images.bin");
-    let extension = if is_binary || !(has("cameras.txt") || has("images.txt")) {
+    let extension = if is_binary(&dir.join(relative)) {
         "bin"
     } else {
         "txt"
@@ -119,6 +192,11 @@ fn pose(values: &[f64; 7]) -> Result<DAffine3, &'static str> {
         rotation.normalize(),
         DVec3::new(tx, ty, tz),
     ))
+}
+
+/// COLMAP writes -1 where it has not computed an error.
+fn known_error(error_px: f64) -> Option<f64> {
+    (error_px.is_finite() && error_px >= 0.0).then_some(error_px)
 }
 
 /// For entries that no export of today writes.

@@ -27,7 +27,7 @@ fn copied(model: &str, extension: &str) -> tempfile::TempDir {
 
 fn read_all(dir: &Path) -> (Model, Vec<Fault>) {
     let mut faults = Faults::default();
-    let relative = locate(dir, &mut faults).expect("a model");
+    let relative = locate(dir, Path::new(FOLDER), &mut faults).expect("a model");
     let model = read(dir, &relative, &mut faults);
     (model, faults.into_list())
 }

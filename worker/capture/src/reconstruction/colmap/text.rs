@@ -2,11 +2,12 @@
 
 use std::fs::File;
 use std::io::{BufRead, BufReader};
+use std::path::Path;
 use std::str::{FromStr, SplitAsciiWhitespace};
 
 use glam::DVec3;
 
-use super::{REEXPORT_HINT, Source, pose};
+use super::{REEXPORT_HINT, Source, known_error, pose};
 use crate::distortion::{ModelKind, SourceCamera};
 use crate::fault::Faults;
 use crate::reconstruction::{Model, ModelImage, ModelPoint, add_camera};
@@ -169,6 +170,7 @@ fn image(line: &str, at: &str) -> Result<ModelImage, String> {
         name,
         camera_id,
         camera_from_world,
+        mask_path: None,
         at: at.to_owned(),
     })
 }
@@ -196,7 +198,7 @@ fn point(line: &str) -> Result<ModelPoint, String> {
     for value in &mut color {
         *value = number(&mut words, "the colour")?;
     }
-    let error_px = number(&mut words, "the error")?;
+    let error_px: f64 = number(&mut words, "the error")?;
     let mut image_ids = Vec::new();
     while let Some(word) = words.next() {
         image_ids.push(
@@ -213,7 +215,24 @@ fn point(line: &str) -> Result<ModelPoint, String> {
     Ok(ModelPoint {
         position,
         color,
-        error_px,
+        error_px: known_error(error_px),
         image_ids,
     })
+}
+
+/// How many images the file lists: two lines each, of which the second may be empty.
+pub(super) fn count_images(path: &Path) -> u64 {
+    let Ok(file) = File::open(path) else {
+        return 0;
+    };
+    let mut lines = BufReader::new(file).split(b'\n').map_while(Result::ok);
+    let mut count = 0;
+    while let Some(line) = lines.next() {
+        let line = line.trim_ascii();
+        if !line.is_empty() && !line.starts_with(b"#") {
+            count += 1;
+            lines.next();
+        }
+    }
+    count
 }
