@@ -62,4 +62,20 @@ CASES = [
         limit_bytes=lambda r: r["table_bytes"] * (1 + len(r["check"]["chosen"])) / r["items"],
         limit_means="the tables of costs, rays and weights read once for the first gains and once per choice",
     ),
+    Case(
+        name="import",
+        does="24-megapixel JPEGs to 512 px around the object (Scene::load_view); peer: OpenCV imread, remap, INTER_AREA",
+        package="ign-capture", bench="import", arguments=(),
+        peer="opencv_import.py", unit="view", views=1000,
+        limit_bytes=lambda r: r["photograph_bytes"] + r["output_bytes"],
+        limit_means="the file read once, the picture written once",
+    ),
+    Case(
+        name="import_draft",
+        does="the same; peer: Pillow in draft mode at 1/4, mesh transform for the lens, box filter",
+        package="ign-capture", bench="import", arguments=(),
+        peer="pillow_import.py", unit="view", views=1000,
+        limit_bytes=lambda r: r["photograph_bytes"] + r["output_bytes"],
+        limit_means="the file read once, the picture written once",
+    ),
 ]

@@ -52,23 +52,7 @@ pub enum ImportError {
         path: PathBuf,
         /// What the decoder says.
         #[source]
-        source: image::ImageError,
-    },
-    /// A view's photograph or mask changed its size since preflight.
-    #[error("view {view}: {} is {found_width}x{found_height} pixels, its camera says {width}x{height}", path.display())]
-    Size {
-        /// Name of the view.
-        view: String,
-        /// The file.
-        path: PathBuf,
-        /// Width by the camera, in pixels.
-        width: u32,
-        /// Height by the camera, in pixels.
-        height: u32,
-        /// Width of the file's image, in pixels.
-        found_width: u32,
-        /// Height of the file's image, in pixels.
-        found_height: u32,
+        source: crate::PhotoError,
     },
     /// A view index that the scene does not have.
     #[error("the scene has {views} views, there is no view {index}")]

@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use crate::fault::{Faults, ImportError};
-use crate::photographs::{background, check_names, check_photographs, report_unregistered};
+use crate::photographs::{check_names, check_photographs, look_at_some, report_unregistered};
 use crate::proxy::{find_proxy, load_proxy};
 use crate::reconstruction::{self, Model};
-use crate::scene::{Background, CaptureInfo, Point, Scene};
+use crate::scene::{CaptureInfo, Point, Scene};
 use crate::settings;
 use crate::sight::{SeeingView, keep_those_that_see};
 use crate::split::{check_split, held_out_names, split};
@@ -37,7 +37,7 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     let registered = check_names(&model, &mut faults);
     // Of a model that was read in part, what seems to be missing in it tells nothing.
     let model_is_whole = model.has_all_images && registered.len() == model.images.len();
-    let (candidates, has_masks) = check_photographs(dir, &model, &registered, &mut faults);
+    let candidates = check_photographs(dir, &model, &registered, settings.masks, &mut faults);
     if model_is_whole {
         report_unregistered(&dir.join("images"), &registered, &mut faults);
     }
@@ -48,7 +48,7 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     let Some(mesh) = mesh else {
         return Err(ImportError::Faults(faults.into_list()));
     };
-    let views = keep_those_that_see(candidates, &mesh, proxy.as_deref(), &mut faults);
+    let mut views = keep_those_that_see(candidates, &mesh, proxy.as_deref(), &mut faults);
     let names: Vec<&str> = views
         .iter()
         .map(|(view, _, _)| view.name.as_str())
@@ -57,11 +57,7 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     if views_are_complete && !faults.has_errors() {
         check_split(&train, &held_out, &mut faults);
     }
-    let background = if has_masks {
-        background(&views, settings.mask_is_background, &mut faults)
-    } else {
-        Background::Silhouette
-    };
+    let background = look_at_some(&mut views, &mut faults);
     if faults.has_errors() {
         return Err(ImportError::Faults(faults.into_list()));
     }
@@ -99,7 +95,6 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
         points,
         warnings: faults.into_list(),
         background,
-        mask_is_background: settings.mask_is_background,
         bounds,
     })
 }

@@ -31,8 +31,6 @@ pub struct Scene {
     pub warnings: Vec<Fault>,
     /// What surrounds the object in the photographs.
     pub background: Background,
-    /// Whether black in the masks stands for the object.
-    pub(crate) mask_is_background: bool,
     /// Per view, the proxy's bounds inside the undistorted photograph.
     pub(crate) bounds: Vec<Bounds>,
 }
@@ -71,8 +69,29 @@ pub struct View {
     pub(crate) rolled_columns: usize,
     /// The photograph.
     pub image_path: PathBuf,
-    /// Its mask, where the capture has masks.
-    pub mask_path: Option<PathBuf>,
+    /// What says which part of it is the object, where something does.
+    pub mask: Option<Mask>,
+    /// What says which part of it counts neither as object nor as background: a hand, a stand. White is ignored.
+    pub ignored: Option<MaskFile>,
+}
+
+/// The mask of an object.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Mask {
+    /// A file in which white is the object.
+    File(MaskFile),
+    /// The photograph's own alpha channel, which is straight: colours are not multiplied by it in the file. They are
+    /// when the view is loaded, in linear light.
+    Alpha,
+}
+
+/// A mask in a file of its own.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MaskFile {
+    /// The file.
+    pub path: PathBuf,
+    /// Black stands for white and white for black.
+    pub inverted: bool,
 }
 
 /// A point of the sparse reconstruction.

@@ -7,7 +7,7 @@
 //! rights = "The Museum"
 //! proxy = "scan/mesh.ply"           # a file in the capture
 //! reconstruction = "cameras.xml"    # a file in the capture, or a folder with a COLMAP model
-//! masks = "white_is_object"         # or "white_is_background"
+//! masks = "white_is_object"         # or "white_is_background", "white_is_ignored", "black_is_ignored"
 //! metres_per_scene_unit = 0.12
 //! held_out = ["IMG_0007.jpg"]       # as test.txt
 //! ```
@@ -28,6 +28,19 @@ pub(crate) const FILE_NAME: &str = "capture.toml";
 const KEYS: &str =
     "object, title, licence, rights, proxy, reconstruction, masks, metres_per_scene_unit, held_out";
 
+/// What the masks in files mean.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum MaskMeaning {
+    /// The rest is background.
+    WhiteIsObject,
+    /// The rest is the object.
+    WhiteIsBackground,
+    /// A hand, a stand: neither object nor background. The rest is either.
+    WhiteIsIgnored,
+    /// The rest may be either object or background.
+    BlackIsIgnored,
+}
+
 /// The file's content; the default is what holds without the file.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Settings {
@@ -37,7 +50,7 @@ pub(crate) struct Settings {
     pub(crate) rights: Option<String>,
     pub(crate) proxy: Option<(PathBuf, usize)>,
     pub(crate) reconstruction: Option<(PathBuf, usize)>,
-    pub(crate) mask_is_background: bool,
+    pub(crate) masks: Option<MaskMeaning>,
     pub(crate) metres_per_scene_unit: Option<f64>,
     /// Names with their line.
     pub(crate) held_out: Option<Vec<(String, usize)>>,
@@ -129,11 +142,15 @@ fn parse(text: &str, faults: &mut Faults) -> Settings {
                 ),
             },
             "masks" => match text_of(&value).as_deref() {
-                Some("white_is_object") => settings.mask_is_background = false,
-                Some("white_is_background") => settings.mask_is_background = true,
+                Some("white_is_object") => settings.masks = Some(MaskMeaning::WhiteIsObject),
+                Some("white_is_background") => {
+                    settings.masks = Some(MaskMeaning::WhiteIsBackground);
+                }
+                Some("white_is_ignored") => settings.masks = Some(MaskMeaning::WhiteIsIgnored),
+                Some("black_is_ignored") => settings.masks = Some(MaskMeaning::BlackIsIgnored),
                 _ => wrong(
                     "has an unknown meaning",
-                    "use \"white_is_object\" or \"white_is_background\"",
+                    "use \"white_is_object\", \"white_is_background\", \"white_is_ignored\" or \"black_is_ignored\"",
                 ),
             },
             "metres_per_scene_unit" => match scalar(value.get_ref()) {
@@ -206,7 +223,7 @@ mod tests {
                 rights: Some("R".into()),
                 proxy: Some(("x/m.ply".into(), 5)),
                 reconstruction: Some(("sparse/3".into(), 10)),
-                mask_is_background: true,
+                masks: Some(MaskMeaning::WhiteIsBackground),
                 metres_per_scene_unit: Some(10.0),
                 held_out: Some(vec![("1.png".into(), 8), ("2.png".into(), 9)]),
             }

@@ -171,7 +171,9 @@ fn masks_of_transforms_json_are_taken() {
         scene
             .views
             .iter()
-            .all(|view| view.mask_path.as_deref() == Some(&*dir.path().join("other/mask.png")))
+            .all(|view| view.ignored.as_ref().is_some_and(
+                |ignored| ignored.inverted && ignored.path == dir.path().join("other/mask.png")
+            ) && view.mask.is_none())
     );
 }
 

@@ -341,10 +341,10 @@ fn masks_are_found_by_both_names_and_checked() {
 #[test]
 fn damaged_pixels_are_a_typed_error_when_loaded() {
     let capture = Capture::sound();
+    let scene = capture.import();
     let path = capture.path("images/img 3.png");
     let bytes = fs::read(&path).expect("the picture");
     fs::write(&path, &bytes[..bytes.len() - 40]).expect("cut short");
-    let scene = capture.import();
     let camera = scene.views[3].camera;
     let error = scene.load_view(3, &camera).expect_err("a damaged picture");
     assert!(
