@@ -12,6 +12,9 @@ use crate::Similarity;
 /// Refinement steps of the bounding sphere; its radius is then within about 1 % of the smallest possible.
 const SPHERE_STEPS: u32 = 100;
 
+/// Coordinates beyond this would overflow where they are squared or multiplied.
+const LARGEST: f64 = 1e100;
+
 /// Cosine of the angle between two faces at a vertex beyond which they are taken to be wound against each other. No
 /// corner of an object is near it, as a box's is near 0: there a rounding would decide.
 const OPPOSITE_COSINE: f64 = -0.5;
@@ -70,6 +73,14 @@ pub enum MeshError {
         /// Number of vertices.
         vertices: usize,
     },
+    /// A coordinate so large that its square is not finite.
+    #[error("vertex {vertex} has the coordinate {coordinate:e}, beyond 1e100")]
+    TooFar {
+        /// Index of the first such vertex, from 0.
+        vertex: usize,
+        /// Its largest coordinate.
+        coordinate: f64,
+    },
     /// No triangle with an area.
     #[error("no triangle with an area is left of {triangles}")]
     NoTriangles {
@@ -102,7 +113,7 @@ impl Mesh {
     /// the area-weighted mean of the adjacent faces' normals, whichever way round these are wound.
     ///
     /// # Errors
-    /// [`MeshError`] for coordinates that are not finite, indices out of range, or no triangle left.
+    /// [`MeshError`] for coordinates that are not finite or beyond 1e100, indices out of range, or no triangle left.
     pub fn new(positions: Vec<DVec3>, triangles: Vec<[u32; 3]>) -> Result<Self, MeshError> {
         let largest = positions.len().max(triangles.len());
         if largest >= u32::MAX as usize {
@@ -110,6 +121,13 @@ impl Mesh {
         }
         if let Some(vertex) = positions.iter().position(|position| !position.is_finite()) {
             return Err(MeshError::NotFinite { vertex });
+        }
+        let largest = |position: &DVec3| position.abs().max_element();
+        if let Some(vertex) = positions.iter().position(|p| largest(p) > LARGEST) {
+            return Err(MeshError::TooFar {
+                vertex,
+                coordinate: largest(&positions[vertex]),
+            });
         }
         for (triangle, corners) in triangles.iter().enumerate() {
             if let Some(&index) = corners

@@ -208,6 +208,9 @@ fn of_each_loss() {
     check("diffuse distance", &p, 120, &|p| {
         losses::diffuse_distance(p, &q, &visible)
     });
+    check("diffuse distance by the other", &q, 120, &|q| {
+        losses::diffuse_distance(&p, q, &visible)
+    });
     // Some observations are clipped: they must not pull at what they predict.
     let bright = &p + Tensor::rand([40, 3], F64).gt(0.8).to_kind(Kind::Double);
     let (here, there) = (random(&[40, 3]) * 0.1, random(&[40, 3]) * 0.1);
@@ -299,6 +302,26 @@ fn of_the_networks() {
             &coverage,
         )
     });
+    // Through candidates that learned effects have gone into.
+    let exact = params.with_flat(&params.flat().to_kind(Kind::Double));
+    check(
+        "blending head by its candidates",
+        &input.candidates,
+        150,
+        &|candidates| {
+            let input = BlendInput {
+                candidates: candidates.shallow_clone(),
+                prior: input.prior.shallow_clone(),
+                visibility: input.visibility.shallow_clone(),
+                target: input.target.shallow_clone(),
+            };
+            losses::blend(
+                &(blend.forward(&exact, &input) * &coverage),
+                &truth,
+                &coverage,
+            )
+        },
+    );
 
     let geometry = random(&[1, 9, 64, 64]);
     let wanted = random(&[1, 3, 64, 64]);
@@ -321,4 +344,15 @@ fn of_the_networks() {
     check_params("PatchGAN", &params, 12, &|params| {
         losses::adversarial(&net.forward(params, &geometry, &wanted, true), true)
     });
+    // What the generator learns from: l1 to the photograph, and a discriminator that takes its image for one.
+    let params = params.with_flat(&params.flat().to_kind(Kind::Double));
+    check(
+        "l1 and GAN loss by the generated image",
+        &wanted,
+        60,
+        &|image| {
+            losses::l1(image, &(&wanted * 0.9 + 0.02))
+                + losses::adversarial(&net.forward(&params, &geometry, image, false), true) * 0.01
+        },
+    );
 }

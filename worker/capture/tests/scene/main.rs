@@ -2,6 +2,7 @@
 
 mod common;
 mod formats;
+mod hard;
 mod loading;
 mod photographs;
 mod preflight;
