@@ -4,6 +4,9 @@
 //! (a rendering or a cut-out with coverage), the colour is divided by the coverage in linear light, which gives the
 //! object's own colour, and the coverage stays as the pixel's weight. Where a photograph shows background, rim pixels
 //! cannot be repaired: they are left out by a weight that starts one pixel inside the mask or silhouette.
+//!
+//! What the capture says to ignore (a hand, a stand) counts as lying outside the photograph: it has no weight as a
+//! colour to learn from or to show, is black in both images that are compared, and is no part of the object's score.
 
 use ign_capture::{Background, Frame, ImportError, Scene, ViewImage};
 use ign_geometry::select::Candidates;
@@ -155,8 +158,8 @@ impl<'a> Dataset<'a> {
                 scored[pixel] = 0.0;
             }
             let factor = match self.scene.background {
-                Background::Black => 1.0,
-                Background::MaskedOut | Background::Silhouette => mask,
+                Background::Black if image.mask.is_some() => 1.0,
+                _ => mask,
             };
             for channel in 0..3 {
                 truth[pixel * 3 + channel] *= factor * scored[pixel];
@@ -269,9 +272,9 @@ fn unmultiplied(image: &ViewImage, mask: &[f32]) -> (Vec<f32>, Vec<f32>) {
     let mut rgb = image.rgb.clone();
     let mut alpha = vec![0.0; mask.len()];
     for (at, &coverage) in mask.iter().enumerate() {
-        let coverage = coverage.min(image.inside[at]);
-        if coverage >= LEAST_COVERAGE {
-            alpha[at] = coverage;
+        let weight = coverage.min(image.inside[at]);
+        if weight >= LEAST_COVERAGE {
+            alpha[at] = weight;
             for value in &mut rgb[at * 3..at * 3 + 3] {
                 *value = encoded((linear(*value) / coverage).clamp(0.0, 1.0));
             }
@@ -309,4 +312,83 @@ pub(crate) fn errors_255(image: &Tensor, view: &Scored) -> (f64, f64) {
         squared.mean(Kind::Float).double_value(&[]),
         on_object.double_value(&[]),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use ign_capture::{ImportOptions, import};
+
+    use super::*;
+
+    /// What masks of ignored pixels leave out.
+    fn is_ignored(x: u32) -> bool {
+        x < 24
+    }
+
+    #[test]
+    fn ignored_pixels_are_neither_learnt_nor_shown_nor_scored() {
+        let folder = tempfile::tempdir().expect("a scratch folder");
+        let dir = folder.path().join("capture");
+        let options = ign_demo::DemoOptions {
+            size: 48,
+            views: 12,
+            seed: 3,
+            ..ign_demo::DemoOptions::default()
+        };
+        ign_demo::generate(&dir, &options, &|_, _| {}).expect("a demo capture");
+        let load = || import(&dir, &ImportOptions::default()).expect("a sound capture");
+        let recipe = Recipe {
+            size: 48,
+            crop: Crop::None,
+            ..Recipe::default()
+        };
+        let settings = recipe.resolve(10).expect("settings");
+        let parts = |scene: &Scene| {
+            let data = Dataset::new(scene, &recipe, &settings, Device::Cpu).expect("a dataset");
+            let view = data.train[0];
+            let straight = data.straight(view, 1).expect("a view");
+            (data.scored(view).expect("a view"), straight)
+        };
+        let masks = dir.join("masks");
+        std::fs::remove_dir_all(&masks).expect("masks of the demo");
+        let (whole, whole_straight) = parts(&load());
+
+        std::fs::create_dir(&masks).expect("a folder");
+        for view in load().views {
+            let mask = image::GrayImage::from_fn(48, 48, |x, _| {
+                image::Luma([if is_ignored(x) { 255 } else { 0 }])
+            });
+            let name = std::path::Path::new(&view.name).with_extension("png");
+            mask.save(masks.join(name)).expect("a mask");
+        }
+        std::fs::write(dir.join("capture.toml"), "masks = \"white_is_ignored\"\n").expect("a file");
+        let (part, part_straight) = parts(&load());
+
+        let flat = |tensor: &Tensor| ign_nets::params::flat_values(tensor);
+        let (truth, counted) = (flat(&part.truth), flat(&part.counted));
+        let whole_truth = flat(&whole.truth);
+        let mut on_object = 0;
+        for at in 0..48 * 48 {
+            let x = (at % 48) as u32;
+            if is_ignored(x) {
+                on_object += usize::from(whole.object[at]);
+                assert_eq!((counted[at], part.object[at]), (0.0, false));
+                assert_eq!(part_straight.alpha[at], 0.0);
+                for channel in 0..3 {
+                    assert_eq!(truth[channel * 48 * 48 + at], 0.0);
+                }
+            } else if x > 24 {
+                assert_eq!(part.object[at], whole.object[at]);
+                assert_eq!(part_straight.alpha[at], whole_straight.alpha[at]);
+                for channel in 0..3 {
+                    let at = channel * 48 * 48 + at;
+                    assert!((truth[at] - whole_truth[at]).abs() < 1e-6);
+                }
+            }
+        }
+        assert!(
+            on_object > 50,
+            "the object hardly reaches there: {on_object}"
+        );
+    }
 }
