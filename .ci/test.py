@@ -17,6 +17,7 @@ import time
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 NO_TORCH = ["-p", "ignctl", "-p", "ign-coordinator"]
+KUBERNETES_VALIDATE = "1.37.0"
 RESULT = re.compile(r"^test result: \w+\. (\d+) passed; (\d+) failed;")
 
 
@@ -75,6 +76,21 @@ def builds_without_torch():
     return True
 
 
+def manifests_hold():
+    """The Kubernetes manifests fit Kubernetes' schemas, and their arguments the programs that were built."""
+    cache = os.environ.get("IGN_CACHE_DIR") or os.path.join(
+        os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "ign"
+    )
+    packages = os.path.join(cache, f"kubernetes-validate-{KUBERNETES_VALIDATE}")
+    if not os.path.exists(packages):
+        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        if not run(*pip, "--target", f"{packages}.part", f"kubernetes-validate=={KUBERNETES_VALIDATE}"):
+            return False
+        os.rename(f"{packages}.part", packages)
+    binaries = os.path.join(os.environ.get("CARGO_TARGET_DIR", "target"), "debug")
+    return run(sys.executable, "services/deploy/check.py", binaries, env={"PYTHONPATH": packages})
+
+
 def run_tests():
     """All tests; passed and failed."""
     # The binaries that end-to-end tests start are built by the same command and profile as the tests.
@@ -108,6 +124,7 @@ def main():
     ]
     passed, failed = run_tests()
     steps.append(("building without libtorch", builds_without_torch()))
+    steps.append(("Kubernetes manifests", manifests_hold()))
     for name, good in steps:
         if not good:
             say(f"error: {name} failed")
