@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use ign_proto::MAX_MESSAGE_BYTES;
 use ign_proto::v1::bundles_client::BundlesClient;
+use ign_proto::v1::collections_client::CollectionsClient;
 use ign_proto::v1::jobs_client::JobsClient;
 use ign_proto::v1::tokens_client::TokensClient;
 use reqwest::Url;
@@ -251,6 +252,11 @@ impl Connection {
     /// Client of the job calls.
     pub(crate) fn jobs(&self) -> JobsClient<Admitted> {
         JobsClient::new(self.admitted()).max_decoding_message_size(MAX_MESSAGE_BYTES)
+    }
+
+    /// Client of the calls about collections.
+    pub(crate) fn collections(&self) -> CollectionsClient<Admitted> {
+        CollectionsClient::new(self.admitted()).max_decoding_message_size(MAX_MESSAGE_BYTES)
     }
 
     /// Client of the bundle calls.

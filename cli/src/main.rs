@@ -5,6 +5,7 @@
 //! command line, 3 when the coordinator cannot be reached, 4 when a timeout passed.
 //! Invariant: nothing here links libtorch; what needs it runs in `ign-worker`.
 
+mod bag;
 mod commands;
 mod connection;
 mod data_plane;
@@ -23,7 +24,9 @@ use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser};
 
-use crate::commands::{bake, bundle, completions, doctor, jobs, status, submit, token, up};
+use crate::commands::{
+    bake, bundle, collections, completions, doctor, jobs, status, submit, token, up,
+};
 use crate::connection::ConnectionArgs;
 use crate::output::Format;
 use crate::problem::{Exit, Problem};
@@ -72,8 +75,13 @@ enum Command {
     Cancel(jobs::JobArgs),
     /// Queue failed or cancelled jobs again
     Retry(jobs::JobArgs),
+    /// Bake the captures of jobs once more, with another recipe
+    Rebake(jobs::RebakeArgs),
     /// Wait until jobs have ended
     Wait(jobs::WaitArgs),
+    /// Set shares and limits of collections, pause and resume them
+    #[command(subcommand)]
+    Collections(collections::Command),
     /// Look at model bundles, fetch and verify them
     #[command(subcommand)]
     Bundle(bundle::Command),
@@ -142,7 +150,9 @@ async fn run(cli: Cli) -> Result<(), Problem> {
         Command::Logs(args) => jobs::logs(&context, &args).await,
         Command::Cancel(args) => jobs::cancel(&context, &args).await,
         Command::Retry(args) => jobs::retry(&context, &args).await,
+        Command::Rebake(args) => jobs::rebake(&context, &args).await,
         Command::Wait(args) => jobs::wait(&context, &args).await,
+        Command::Collections(command) => collections::run(&context, &command).await,
         Command::Bundle(command) => bundle::run(&context, &command).await,
         Command::Token(command) => token::run(&context, &command).await,
         Command::Doctor(args) => doctor::run(&context, &args).await,

@@ -1,5 +1,6 @@
 //! From a capture folder to a submitted job: hash, send what the store lacks, write the manifest, submit.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -23,6 +24,7 @@ pub(crate) struct Order {
     pub(crate) object: ObjectName,
     pub(crate) recipe: Recipe,
     pub(crate) priority: i32,
+    pub(crate) labels: BTreeMap<String, String>,
 }
 
 /// Hashes and uploads the capture of `order`; returns its digest.
@@ -78,7 +80,7 @@ pub(crate) fn spec(order: &Order, capture: &Digest) -> Result<v1::JobSpec, Probl
         capture_digest: capture.to_string(),
         recipe_json: order.recipe.json()?,
         priority: order.priority,
-        labels: std::collections::HashMap::new(),
+        labels: order.labels.clone().into_iter().collect(),
         max_attempts: 0,
     })
 }
@@ -86,7 +88,7 @@ pub(crate) fn spec(order: &Order, capture: &Digest) -> Result<v1::JobSpec, Probl
 /// A request id that repeats for the same specification and `salt`.
 pub(crate) fn request_id(spec: &v1::JobSpec, salt: &str) -> String {
     let object = spec.object.clone().unwrap_or_default();
-    let text = [
+    let mut text = [
         object.collection.as_str(),
         &object.object,
         &spec.capture_digest,
@@ -95,6 +97,10 @@ pub(crate) fn request_id(spec: &v1::JobSpec, salt: &str) -> String {
         salt,
     ]
     .join("\n");
+    let labels: BTreeMap<&String, &String> = spec.labels.iter().collect();
+    for (key, value) in labels {
+        text.push_str(&format!("\n{key:?}={value:?}"));
+    }
     Digest::of(text.as_bytes()).hex()[..32].to_string()
 }
 
@@ -135,6 +141,9 @@ mod tests {
         assert_ne!(id, request_id(&spec_with(0, "b"), ""));
         assert_ne!(id, request_id(&spec_with(1, "a"), ""));
         assert_ne!(id, request_id(&spec_with(0, "a"), "again"));
+        let mut labelled = spec_with(0, "a");
+        labelled.labels.insert("room".into(), "3".into());
+        assert_ne!(id, request_id(&labelled, ""));
         assert_eq!(id.len(), 32);
     }
 }

@@ -68,6 +68,7 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
         object: args.object.clone(),
         recipe,
         priority: 0,
+        labels: std::collections::BTreeMap::new(),
     };
 
     loop {

@@ -1,8 +1,8 @@
-//! Commands about jobs: `jobs get|list`, `logs`, `cancel`, `retry`, `wait`.
+//! Commands about jobs: `jobs get|list`, `logs`, `cancel`, `retry`, `rebake`, `wait`.
 //!
 //! A job is named by its id, by an unambiguous beginning of it, or by `collection/object` for that object's newest job.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use chrono::{DateTime, Utc};
@@ -15,6 +15,8 @@ use crate::Context;
 use crate::connection::Connection;
 use crate::output::{self, Format, Live};
 use crate::problem::Problem;
+use crate::recipe::{RecipeArgs, key_value};
+use crate::upload;
 use crate::views::{JobView, is_terminal, job_table, short_id, time};
 use crate::watch;
 
@@ -27,12 +29,12 @@ pub(crate) enum Command {
         job: String,
     },
     /// List jobs, newest first
-    List(ListArgs),
+    List(Query),
 }
 
-/// Arguments of `jobs list`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct ListArgs {
+/// Which jobs: those for which all of it holds.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub(crate) struct Query {
     /// Only jobs in this state; may be given again
     #[arg(long, value_parser = state)]
     state: Vec<v1::JobState>,
@@ -40,16 +42,42 @@ pub(crate) struct ListArgs {
     #[arg(long, value_name = "C")]
     collection: Option<CollectionId>,
     /// Only this object
-    #[arg(long, value_name = "C/O")]
+    #[arg(long, value_name = "C/O", conflicts_with = "collection")]
     object: Option<ObjectName>,
+    /// Only jobs with this label; may be given again
+    #[arg(long = "label", value_name = "KEY=VALUE", value_parser = key_value)]
+    labels: Vec<(String, String)>,
 }
 
-/// Arguments of `cancel` and `retry`.
+impl Query {
+    fn is_empty(&self) -> bool {
+        self.state.is_empty()
+            && self.collection.is_none()
+            && self.object.is_none()
+            && self.labels.is_empty()
+    }
+}
+
+/// Arguments of `cancel` and `retry`: jobs by name, or all that a query finds.
 #[derive(Debug, clap::Args)]
 pub(crate) struct JobArgs {
     /// Job ids, their beginnings, or C/O for an object's newest job
-    #[arg(required = true, value_name = "JOB")]
+    #[arg(value_name = "JOB", conflicts_with_all = ["state", "collection", "object", "labels"])]
     jobs: Vec<String>,
+    #[command(flatten)]
+    query: Query,
+}
+
+/// Arguments of `rebake`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct RebakeArgs {
+    #[command(flatten)]
+    which: JobArgs,
+    /// Jobs of higher priority go first
+    #[arg(long, value_name = "N", default_value_t = 0, allow_hyphen_values = true, value_parser = clap::value_parser!(i32).range(-1000..=1000))]
+    priority: i32,
+    #[command(flatten)]
+    recipe: RecipeArgs,
 }
 
 /// Arguments of `logs`.
@@ -109,13 +137,11 @@ async fn find(connection: &Connection, name: &str) -> Result<v1::Job, Problem> {
         let object: ObjectName = name
             .parse()
             .map_err(|error| Problem::usage(format!("{error}")))?;
-        let jobs = list_all(
-            connection,
-            Some(object.collection.as_str()),
-            Some(object.object.as_str()),
-            &[],
-        )
-        .await?;
+        let query = Query {
+            object: Some(object.clone()),
+            ..Query::default()
+        };
+        let jobs = list_all(connection, &query).await?;
         return jobs
             .into_iter()
             .next()
@@ -128,23 +154,23 @@ async fn find(connection: &Connection, name: &str) -> Result<v1::Job, Problem> {
 }
 
 /// All pages of a listing, newest job first.
-pub(crate) async fn list_all(
-    connection: &Connection,
-    collection: Option<&str>,
-    object: Option<&str>,
-    states: &[v1::JobState],
-) -> Result<Vec<v1::Job>, Problem> {
+async fn list_all(connection: &Connection, query: &Query) -> Result<Vec<v1::Job>, Problem> {
+    let (collection, object) = match (&query.object, &query.collection) {
+        (Some(name), _) => (name.collection.to_string(), name.object.to_string()),
+        (None, Some(collection)) => (collection.to_string(), String::new()),
+        (None, None) => (String::new(), String::new()),
+    };
     let mut client = connection.jobs();
     let mut jobs = Vec::new();
     let mut page_token = String::new();
     loop {
         let request = v1::ListJobsRequest {
-            collection: collection.unwrap_or_default().to_string(),
-            object: object.unwrap_or_default().to_string(),
-            states: states.iter().map(|state| i32::from(*state)).collect(),
+            collection: collection.clone(),
+            object: object.clone(),
+            states: query.state.iter().map(|state| i32::from(*state)).collect(),
+            labels: query.labels.iter().cloned().collect(),
             page_size: 500,
             page_token,
-            ..Default::default()
         };
         let page = client.list(request).await?.into_inner();
         jobs.extend(page.jobs);
@@ -165,12 +191,8 @@ pub(crate) async fn run(context: &Context, command: &Command) -> Result<(), Prob
             let view = JobView::from(&find(&connection, job).await?);
             output::data(context.format, &view, || details(&view, Utc::now()))
         }
-        Command::List(args) => {
-            let (collection, object) = match (&args.collection, &args.object) {
-                (_, Some(name)) => (Some(name.collection.as_str()), Some(name.object.as_str())),
-                (collection, None) => (collection.as_ref().map(CollectionId::as_str), None),
-            };
-            let jobs = list_all(&connection, collection, object, &args.state).await?;
+        Command::List(query) => {
+            let jobs = list_all(&connection, query).await?;
             let views: Vec<JobView> = jobs.iter().map(JobView::from).collect();
             if views.is_empty() {
                 output::note("no job");
@@ -271,23 +293,42 @@ pub(crate) async fn retry(context: &Context, args: &JobArgs) -> Result<(), Probl
     act(context, args, Act::Retry).await
 }
 
-async fn act(context: &Context, args: &JobArgs, act: Act) -> Result<(), Problem> {
-    let connection = Connection::open(&context.connection).await?;
-    let mut done = Vec::new();
-    let mut worst: Option<Problem> = None;
+/// The jobs that the arguments choose; what cannot be found is told at once, and the rest goes on.
+async fn chosen(
+    connection: &Connection,
+    args: &JobArgs,
+    worst: &mut Option<Problem>,
+) -> Result<Vec<v1::Job>, Problem> {
+    if args.jobs.is_empty() && args.query.is_empty() {
+        return Err(Problem::usage("no job is named")
+            .hint("name jobs, or choose them with --collection, --object, --state and --label"));
+    }
+    if args.jobs.is_empty() {
+        let jobs = list_all(connection, &args.query).await?;
+        output::note(&format!("{} jobs", jobs.len()));
+        return Ok(jobs);
+    }
+    let mut jobs = Vec::new();
     for name in &args.jobs {
-        match act_on(&connection, name, act).await {
-            Ok(job) => done.push(JobView::from(&job)),
-            Err(problem) => {
-                let problem = problem.context(format!("job {name}"));
-                output::problem(&problem);
-                worst = Some(problem);
-            }
+        match find(connection, name).await {
+            Ok(job) => jobs.push(job),
+            Err(problem) => tell(worst, problem, name),
         }
     }
-    output::data(context.format, &done, || match done.len() {
+    Ok(jobs)
+}
+
+fn tell(worst: &mut Option<Problem>, problem: Problem, job: &str) {
+    let problem = problem.context(format!("job {job}"));
+    output::problem(&problem);
+    *worst = Some(problem);
+}
+
+/// Prints what became of the jobs; fails when something was told before.
+fn ended(context: &Context, jobs: &[JobView], worst: Option<Problem>) -> Result<(), Problem> {
+    output::data(context.format, &jobs, || match jobs.len() {
         0 => String::new(),
-        _ => job_table(&done, Utc::now()),
+        _ => job_table(jobs, Utc::now()),
     })?;
     match worst {
         Some(problem) => Err(Problem::said(problem.exit)),
@@ -295,10 +336,34 @@ async fn act(context: &Context, args: &JobArgs, act: Act) -> Result<(), Problem>
     }
 }
 
-async fn act_on(connection: &Connection, name: &str, act: Act) -> Result<v1::Job, Problem> {
-    let request = v1::GetJobRequest {
-        job_id: find(connection, name).await?.id,
-    };
+async fn act(context: &Context, args: &JobArgs, act: Act) -> Result<(), Problem> {
+    let connection = Connection::open(&context.connection).await?;
+    let (mut done, mut worst) = (Vec::new(), None);
+    for job in chosen(&connection, args, &mut worst).await? {
+        // Of many, those that the call is not for are left as they are; a job that was named gets an answer.
+        if args.jobs.is_empty() && !act.is_for(job.state()) {
+            continue;
+        }
+        match act_on(&connection, job.id.clone(), act).await {
+            Ok(job) => done.push(JobView::from(&job)),
+            Err(problem) => tell(&mut worst, problem, &short_id(&job.id)),
+        }
+    }
+    ended(context, &done, worst)
+}
+
+impl Act {
+    /// Whether the call changes a job in this state.
+    fn is_for(self, state: v1::JobState) -> bool {
+        match self {
+            Self::Cancel => !is_terminal(state),
+            Self::Retry => matches!(state, v1::JobState::Failed | v1::JobState::Cancelled),
+        }
+    }
+}
+
+async fn act_on(connection: &Connection, job_id: String, act: Act) -> Result<v1::Job, Problem> {
+    let request = v1::GetJobRequest { job_id };
     let mut client = connection.jobs();
     let answer = match act {
         Act::Cancel => client.cancel(request).await?,
@@ -312,6 +377,38 @@ async fn act_on(connection: &Connection, name: &str, act: Act) -> Result<v1::Job
         ));
     }
     Ok(job)
+}
+
+/// Queues the captures of the chosen jobs again under the recipe given now; nothing is sent, the store has them.
+pub(crate) async fn rebake(context: &Context, args: &RebakeArgs) -> Result<(), Problem> {
+    let connection = Connection::open(&context.connection).await?;
+    let salt = Utc::now().timestamp_micros().to_string();
+    let (mut done, mut worst) = (Vec::new(), None);
+    let mut seen = BTreeSet::new();
+    for job in chosen(&connection, &args.which, &mut worst).await? {
+        let Some(spec) = job.spec else { continue };
+        // Newest first: an object that was baked several times is baked once more, from its newest capture.
+        if !seen.insert(
+            spec.object
+                .as_ref()
+                .map(|o| (o.collection.clone(), o.object.clone())),
+        ) {
+            continue;
+        }
+        let before: Option<crate::recipe::Recipe> = serde_json::from_str(&spec.recipe_json).ok();
+        let recipe = args.recipe.recipe(before.and_then(|recipe| recipe.proxy))?;
+        let spec = v1::JobSpec {
+            recipe_json: recipe.json()?,
+            priority: args.priority,
+            ..spec
+        };
+        let request_id = upload::request_id(&spec, &salt);
+        match upload::submit(&connection, spec, request_id).await {
+            Ok(job) => done.push(JobView::from(&job)),
+            Err(problem) => tell(&mut worst, problem, &short_id(&job.id)),
+        }
+    }
+    ended(context, &done, worst)
 }
 
 /// One line of a log, as `-o json` writes it, one object per line.

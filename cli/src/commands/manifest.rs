@@ -1,17 +1,19 @@
 //! The CSV list of captures that `submit --manifest` reads.
 //!
 //! One header line names the columns, in any order: `path`, `collection`, `object`, and optionally `preset`, `size`,
-//! `priority`. Paths are relative to the list's own folder. Empty optional cells take the command line's value; lines that
+//! `priority`, `labels` (`key=value`, several with `;` between). Paths are relative to the list's own folder. Empty optional cells take the command line's value; lines that
 //! are empty or begin with `#` are skipped. All rows are read before anything is sent, and every fault is reported.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use ign_proto::ObjectName;
 
 use crate::problem::Problem;
+use crate::recipe::key_value;
 
 const REQUIRED: [&str; 3] = ["path", "collection", "object"];
-const OPTIONAL: [&str; 3] = ["preset", "size", "priority"];
+const OPTIONAL: [&str; 4] = ["preset", "size", "priority", "labels"];
 
 /// One row.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -23,6 +25,7 @@ pub(crate) struct Row {
     pub(crate) preset: Option<String>,
     pub(crate) size: Option<u32>,
     pub(crate) priority: Option<i32>,
+    pub(crate) labels: BTreeMap<String, String>,
 }
 
 /// Reads the list, or says everything that is wrong with it.
@@ -116,7 +119,7 @@ fn check_header(file: &Path, header: &csv::StringRecord) -> Vec<Problem> {
         .map(|what| {
             Problem::usage(what)
                 .at(&at)
-                .hint("columns are path, collection, object and optionally preset, size, priority")
+                .hint("columns are path, collection, object and optionally preset, size, priority, labels")
         })
         .collect()
 }
@@ -151,6 +154,14 @@ fn row(
             "preset {preset:?} is neither standard nor paper"
         )));
     }
+    let mut labels = BTreeMap::new();
+    for text in cell("labels").unwrap_or("").split(';') {
+        match key_value(text) {
+            Ok((key, value)) => drop(labels.insert(key, value)),
+            Err(_) if text.trim().is_empty() => {}
+            Err(expected) => faults.push(Problem::usage(format!("label {text:?}: {expected}"))),
+        }
+    }
     let mut number = |name: &str, range: std::ops::RangeInclusive<i64>| {
         let text = cell(name)?;
         let value = text
@@ -176,6 +187,7 @@ fn row(
             preset: cell("preset").map(str::to_string),
             size,
             priority,
+            labels,
         }),
         _ => Err(faults),
     }
@@ -207,7 +219,7 @@ mod tests {
     #[test]
     fn columns_in_any_order_and_empty_cells() {
         let rows = parse(
-            "\u{feff}object, collection ,path,size,priority\n# from the north wing\n\nvase,museum,a/vase,128,-5\nbust,museum,b,,\n",
+            "\u{feff}object, collection ,path,size,priority,labels\n# from the north wing\n\nvase,museum,a/vase,128,-5,room=3; photographer = A. B.;\nbust,museum,b,,,\n",
         )
         .unwrap();
         assert_eq!(rows.len(), 2);
@@ -217,13 +229,20 @@ mod tests {
             (Some(128), Some(-5), 4)
         );
         assert_eq!((rows[1].size, rows[1].priority), (None, None));
+        let labels: Vec<(&str, &str)> = rows[0]
+            .labels
+            .iter()
+            .map(|(key, value)| (key.as_str(), value.as_str()))
+            .collect();
+        assert_eq!(labels, [("photographer", "A. B."), ("room", "3")]);
+        assert!(rows[1].labels.is_empty());
         assert_eq!(rows[1].path, Path::new("b"));
     }
 
     #[test]
     fn every_fault_is_reported_with_its_line() {
         let faults = parse(
-            "path,collection,object,preset,size\na,museum,Vase,standard,1\n,museum,bust,best,128\nc,museum\n",
+            "path,collection,object,preset,size,labels\na,museum,Vase,standard,1,=x\n,museum,bust,best,128,\nc,museum\n",
         )
         .unwrap_err();
         insta::assert_snapshot!(faults);

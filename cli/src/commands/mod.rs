@@ -2,6 +2,7 @@
 
 pub(crate) mod bake;
 pub(crate) mod bundle;
+pub(crate) mod collections;
 pub(crate) mod completions;
 pub(crate) mod doctor;
 pub(crate) mod jobs;

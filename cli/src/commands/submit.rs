@@ -12,12 +12,13 @@ use ign_proto::{CollectionId, ObjectName, v1};
 use serde::Serialize;
 
 use crate::Context;
+use crate::bag;
 use crate::commands::{jobs, manifest};
 use crate::connection::Connection;
 use crate::output::{self, Table};
 use crate::pack;
-use crate::problem::{Exit, Problem, chain};
-use crate::recipe::RecipeArgs;
+use crate::problem::{Doing as _, Exit, Problem, chain};
+use crate::recipe::{RecipeArgs, key_value};
 use crate::upload::{self, Order};
 use crate::views::{JobView, ShortIds, short_id, time};
 
@@ -31,7 +32,7 @@ pub(crate) struct Args {
         conflicts_with = "manifest"
     )]
     paths: Vec<PathBuf>,
-    /// CSV list with the columns path, collection, object and optionally preset, size, priority
+    /// CSV list with the columns path, collection, object and optionally preset, size, priority, labels
     #[arg(long, value_name = "CSV")]
     manifest: Option<PathBuf>,
     /// Name of the object, for one capture
@@ -43,6 +44,12 @@ pub(crate) struct Args {
     /// Jobs of higher priority go first
     #[arg(long, value_name = "N", default_value_t = 0, allow_hyphen_values = true, value_parser = clap::value_parser!(i32).range(-1000..=1000))]
     priority: i32,
+    /// Mark the jobs, for listing, cancelling or retrying them together; may be given again
+    #[arg(long = "label", value_name = "KEY=VALUE", value_parser = key_value)]
+    labels: Vec<(String, String)>,
+    /// Write what is wrong, one row per fault, as CSV into this file
+    #[arg(long, value_name = "CSV")]
+    errors: Option<PathBuf>,
     /// Check the captures and queue nothing
     #[arg(long, conflicts_with_all = ["wait", "again"])]
     dry_run: bool,
@@ -83,9 +90,10 @@ struct CheckView {
 }
 
 pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
-    let orders = plan(args)?;
+    let mut errors = ErrorList::create(args.errors.as_deref())?;
+    let orders = plan(args, &mut errors)?;
     if args.dry_run {
-        return dry_run(context, orders).await;
+        return dry_run(context, orders, &mut errors).await;
     }
     let connection = Connection::open(&context.connection).await?;
     let began = connection
@@ -99,7 +107,7 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
     } else {
         String::new()
     };
-    let (mut rows, stopped) = submit_all(&connection, &orders, &salt, began).await;
+    let (mut rows, stopped) = submit_all(&connection, &orders, &salt, began, &mut errors).await?;
 
     let ids: Vec<String> = rows
         .iter()
@@ -139,13 +147,16 @@ fn verdict(rows: &[RowView], waited: bool) -> Result<(), Problem> {
 
 /// All captures that the arguments name, each with its object; every fault of the arguments is found before anything
 /// is sent.
-fn plan(args: &Args) -> Result<Vec<Order>, Problem> {
+fn plan(args: &Args, errors: &mut ErrorList) -> Result<Vec<Order>, Problem> {
     let (orders, problems) = match &args.manifest {
         Some(list) => plan_manifest(args, list)?,
         None => plan_paths(args)?,
     };
     let mut problems = problems;
     problems.extend(duplicates(&orders));
+    for problem in &problems {
+        errors.problem(None, problem)?;
+    }
     match problems.len() {
         0 => Ok(orders),
         1 => Err(problems.remove(0)),
@@ -167,21 +178,28 @@ fn plan_manifest(args: &Args, list: &Path) -> Planned {
     };
     let (mut orders, mut problems) = (Vec::new(), Vec::new());
     for row in rows {
-        if let Err(problem) = pack::check_folder(&row.path) {
-            let at = format!("{}:{}", list.display(), row.line);
-            problems
-                .push(Problem::usage(format!("{} ({})", problem.what, row.path.display())).at(at));
-            continue;
-        }
+        let capture = match pack::check_folder(&row.path).and_then(|()| bag::payload(&row.path)) {
+            Ok(capture) => capture,
+            Err(problem) => {
+                let at = format!("{}:{}", list.display(), row.line);
+                problems.push(
+                    Problem::usage(format!("{} ({})", problem.what, row.path.display())).at(at),
+                );
+                continue;
+            }
+        };
         let mut recipe = args.recipe.recipe(None)?;
         recipe.preset = row.preset.unwrap_or(recipe.preset);
         recipe.size = row.size.unwrap_or(recipe.size);
+        let mut labels: BTreeMap<String, String> = args.labels.iter().cloned().collect();
+        labels.extend(row.labels);
         orders.push(Order {
-            capture: row.path,
+            capture,
             proxy: None,
             object: row.object,
             recipe,
             priority: row.priority.unwrap_or(args.priority),
+            labels,
         });
     }
     Ok((orders, problems))
@@ -195,6 +213,7 @@ fn plan_paths(args: &Args) -> Planned {
         object,
         recipe: recipe.clone(),
         priority: args.priority,
+        labels: args.labels.iter().cloned().collect(),
     };
     if let Some(object) = &args.object {
         let [path] = args.paths.as_slice() else {
@@ -204,7 +223,8 @@ fn plan_paths(args: &Args) -> Planned {
             .hint("use --collection, or a list with --manifest"));
         };
         pack::check_folder(path)?;
-        return Ok((vec![order(path.clone(), object.clone())], Vec::new()));
+        let capture = bag::payload(path)?;
+        return Ok((vec![order(capture, object.clone())], Vec::new()));
     }
     let (mut orders, mut problems) = (Vec::new(), Vec::new());
     for path in &args.paths {
@@ -223,18 +243,26 @@ fn plan_paths(args: &Args) -> Planned {
     Ok((orders, problems))
 }
 
-/// The folder itself when it looks like a capture, otherwise its children that do.
+/// The folder itself when it looks like a capture, otherwise its children that do; of a bag, those of its payload.
 fn captures_in(path: &Path) -> Result<Vec<PathBuf>, Problem> {
     pack::check_folder(path)?;
+    let path = &bag::payload(path)?;
     if pack::looks_like_capture(path) {
-        return Ok(vec![path.to_path_buf()]);
+        return Ok(vec![path.clone()]);
     }
-    let mut captures: Vec<PathBuf> = std::fs::read_dir(path)?
+    let mut children: Vec<PathBuf> = std::fs::read_dir(path)?
         .filter_map(Result::ok)
         .map(|entry| entry.path())
-        .filter(|child| child.is_dir() && pack::looks_like_capture(child))
+        .filter(|child| child.is_dir())
         .collect();
-    captures.sort();
+    children.sort();
+    let mut captures = Vec::new();
+    for child in children {
+        let capture = bag::payload(&child)?;
+        if pack::looks_like_capture(&capture) {
+            captures.push(capture);
+        }
+    }
     if captures.is_empty() {
         return Err(Problem::usage("neither a capture nor a folder of captures")
             .at(path.display())
@@ -293,6 +321,65 @@ fn slug(folder: &str) -> String {
         .collect()
 }
 
+/// The file of `--errors`: one row per fault, written as they are found, so that a broken run leaves them too.
+struct ErrorList(Option<csv::Writer<std::fs::File>>);
+
+/// One row of it.
+#[derive(Serialize)]
+struct ErrorRow<'a> {
+    path: String,
+    object: String,
+    severity: Severity,
+    message: &'a str,
+    at: &'a str,
+    hint: &'a str,
+}
+
+impl ErrorList {
+    fn create(file: Option<&Path>) -> Result<Self, Problem> {
+        let writer = file
+            .map(|file| std::fs::File::create(file).doing("cannot write", file.display()))
+            .transpose()?
+            .map(csv::Writer::from_writer);
+        Ok(Self(writer))
+    }
+
+    fn row(&mut self, row: &ErrorRow<'_>) -> Result<(), Problem> {
+        let Some(writer) = &mut self.0 else {
+            return Ok(());
+        };
+        writer.serialize(row).map_err(|error| {
+            Problem::failed(format!("cannot write the list of errors: {error}"))
+        })?;
+        Ok(writer.flush()?)
+    }
+
+    fn problem(&mut self, order: Option<&Order>, problem: &Problem) -> Result<(), Problem> {
+        self.row(&ErrorRow {
+            path: order.map_or_else(String::new, |order| order.capture.display().to_string()),
+            object: order.map_or_else(String::new, |order| order.object.to_string()),
+            severity: Severity::Error,
+            message: &problem.what,
+            at: &problem.at,
+            hint: &problem.hint,
+        })
+    }
+
+    fn check(&mut self, check: &CheckView) -> Result<(), Problem> {
+        for fault in &check.faults {
+            self.row(&ErrorRow {
+                path: check.path.display().to_string(),
+                object: format!("{}/{}", check.collection, check.object),
+                severity: fault.severity,
+                message: &fault.message,
+                at: &fault.at,
+                hint: &fault.hint,
+            })?;
+        }
+        Ok(())
+    }
+}
+
 /// Two captures that would become the same object: one name is wrong, most likely by its case or its spaces.
 fn duplicates(orders: &[Order]) -> Vec<Problem> {
     let mut seen: BTreeMap<&ObjectName, &Path> = BTreeMap::new();
@@ -319,7 +406,8 @@ async fn submit_all(
     orders: &[Order],
     salt: &str,
     began: DateTime<Utc>,
-) -> (Vec<RowView>, Option<Problem>) {
+    errors: &mut ErrorList,
+) -> Result<(Vec<RowView>, Option<Problem>), Problem> {
     let mut rows = Vec::new();
     for (index, order) in orders.iter().enumerate() {
         let row = |outcome, job, error| RowView {
@@ -351,13 +439,14 @@ async fn submit_all(
                 );
                 let stop = problem.exit == Exit::Unreachable;
                 rows.push(row("error", None, Some(problem.what.clone())));
+                errors.problem(Some(order), &problem)?;
                 if stop {
-                    return (rows, Some(problem));
+                    return Ok((rows, Some(problem)));
                 }
             }
         }
     }
-    (rows, None)
+    Ok((rows, None))
 }
 
 async fn submit_one(
@@ -392,7 +481,11 @@ fn table(rows: &[RowView]) -> String {
     table.to_string()
 }
 
-async fn dry_run(context: &Context, orders: Vec<Order>) -> Result<(), Problem> {
+async fn dry_run(
+    context: &Context,
+    orders: Vec<Order>,
+    errors: &mut ErrorList,
+) -> Result<(), Problem> {
     let mut checks = Vec::new();
     let total = orders.len();
     for (index, order) in orders.into_iter().enumerate() {
@@ -404,6 +497,7 @@ async fn dry_run(context: &Context, orders: Vec<Order>) -> Result<(), Problem> {
         let check = tokio::task::spawn_blocking(move || check(&order))
             .await
             .map_err(|error| Problem::failed(format!("the check stopped: {error}")))?;
+        errors.check(&check)?;
         checks.push(check);
     }
     output::data(context.format, &checks, || check_table(&checks))?;
@@ -566,6 +660,7 @@ mod tests {
                     proxy: None,
                     recipe: recipe.clone(),
                     priority: 0,
+                    labels: BTreeMap::new(),
                 }
             })
             .into();
