@@ -42,6 +42,15 @@ pub(crate) struct ConnectionArgs {
         hide_env_values = true
     )]
     pub(crate) token_file: Option<PathBuf>,
+    /// Authorities of the coordinator's certificate, in PEM [default: those of this machine]
+    #[arg(
+        long,
+        env = "IGN_CA_FILE",
+        global = true,
+        value_name = "FILE",
+        hide_env_values = true
+    )]
+    pub(crate) ca_file: Option<PathBuf>,
     #[arg(
         long,
         help = "Data folder of the service on this machine [default: ~/.local/share/ign]",
@@ -54,6 +63,13 @@ pub(crate) struct ConnectionArgs {
 }
 
 impl ConnectionArgs {
+    fn certificates(&self) -> ign_client::Files {
+        ign_client::Files {
+            ca: self.ca_file.clone(),
+            identity: None,
+        }
+    }
+
     /// The data folder: named, or the user's default.
     pub(crate) fn data_dir(&self) -> Result<PathBuf, Problem> {
         if let Some(dir) = &self.data {
@@ -110,11 +126,16 @@ pub(crate) struct Target {
     pub(crate) url: Url,
     token: MetadataValue<Ascii>,
     bearer: String,
+    tls: ign_client::Tls,
 }
 
 impl Target {
     /// Checks address and token file.
-    pub(crate) fn new(url: &str, token_file: Option<&Path>) -> Result<Self, Problem> {
+    pub(crate) fn new(
+        url: &str,
+        token_file: Option<&Path>,
+        certificates: &ign_client::Files,
+    ) -> Result<Self, Problem> {
         let parsed = Url::parse(url)
             .ok()
             .filter(|parsed| parsed.host_str().is_some())
@@ -122,14 +143,15 @@ impl Target {
                 Problem::usage(format!("{url:?} is no address"))
                     .hint("--server takes http://host:port")
             })?;
-        if parsed.scheme() != "http" {
-            return Err(Problem::usage(format!(
-                "scheme {} is not spoken by this build",
-                parsed.scheme()
-            ))
-            .at(url)
-            .hint("use http:// over a private network, a tunnel or a local TLS proxy"));
+        if !matches!(parsed.scheme(), "http" | "https") {
+            return Err(
+                Problem::usage(format!("scheme {} is not spoken", parsed.scheme()))
+                    .at(url)
+                    .hint("https:// or, within this machine or behind a tunnel, http://"),
+            );
         }
+        let tls =
+            ign_client::Tls::load(certificates).map_err(|error| Problem::usage(chain(&error)))?;
         let token = match token_file {
             Some(file) => std::fs::read_to_string(file).map_err(|error| {
                 Problem::usage(format!("cannot read the token: {error}")).at(file.display())
@@ -137,19 +159,21 @@ impl Target {
             None => String::new(),
         };
         let bearer = format!("Bearer {}", token.trim());
-        let token = MetadataValue::try_from(bearer.as_str())
+        let mut token = MetadataValue::try_from(bearer.as_str())
             .map_err(|error| Problem::usage(format!("the token is malformed: {error}")))?;
+        token.set_sensitive(true);
         Ok(Self {
             url: parsed,
             token,
             bearer,
+            tls,
         })
     }
 
     /// What the arguments name; for the data folder, a service that runs now.
     pub(crate) fn resolve(args: &ConnectionArgs) -> Result<Self, Problem> {
         if let Some(server) = &args.server {
-            return Self::new(server, args.token_file.as_deref());
+            return Self::new(server, args.token_file.as_deref(), &args.certificates());
         }
         let data = args.data_dir()?;
         let endpoint = EndpointFile::of_live_service(&data).ok_or_else(|| {
@@ -158,7 +182,7 @@ impl Target {
                 .hint("start one with `ignctl up`, or name another with --server")
         })?;
         let token_file = args.token_file.as_ref().unwrap_or(&endpoint.token_file);
-        Self::new(&endpoint.url, Some(token_file))
+        Self::new(&endpoint.url, Some(token_file), &args.certificates())
     }
 }
 
@@ -198,7 +222,9 @@ impl Connection {
 
     /// Connects to `target` and makes sure that it answers.
     pub(crate) async fn to(target: Target) -> Result<Self, Problem> {
-        let http = reqwest::Client::builder()
+        let http = target
+            .tls
+            .http(reqwest::Client::builder())
             .connect_timeout(Duration::from_secs(5))
             .read_timeout(Duration::from_mins(1))
             .build()
@@ -232,12 +258,12 @@ impl Connection {
             }
         }
         // Keepalive is off by default; without it a `logs -f` over a dead link would wait for ever.
-        let channel = Endpoint::from_shared(target.url.to_string())
+        let endpoint = Endpoint::from_shared(target.url.to_string())
             .map_err(|error| Problem::usage(chain(&error)).at(&target.url))?
             .connect_timeout(Duration::from_secs(5))
             .http2_keep_alive_interval(Duration::from_secs(20))
-            .keep_alive_timeout(Duration::from_secs(10))
-            .connect_lazy();
+            .keep_alive_timeout(Duration::from_secs(10));
+        let channel = target.tls.channel(&endpoint);
         Ok(Self {
             target,
             channel,
@@ -321,10 +347,10 @@ mod tests {
 
     #[test]
     fn addresses_are_checked_before_use() {
-        for bad in ["", "bakery:7070", "https://bakery", "file:///x", "http://"] {
-            let problem = Target::new(bad, None).unwrap_err();
+        for bad in ["", "bakery:7070", "ftp://bakery", "file:///x", "http://"] {
+            let problem = Target::new(bad, None, &ign_client::Files::default()).unwrap_err();
             assert_eq!(problem.exit, crate::problem::Exit::Usage, "{bad}");
         }
-        assert!(Target::new("http://bakery:7070", None).is_ok());
+        assert!(Target::new("https://bakery:7070", None, &ign_client::Files::default()).is_ok());
     }
 }

@@ -28,6 +28,8 @@ pub(crate) struct Options {
     /// Threads per worker; none to share the cores among the workers.
     pub(crate) threads: Option<usize>,
     pub(crate) listen: SocketAddr,
+    /// Something in front speaks TLS: listening beyond this machine is fine.
+    pub(crate) behind_tls_proxy: bool,
     /// Whether this is a bake's own service: workers that keep dying end it, and the coordinator logs to a file.
     pub(crate) own: bool,
 }
@@ -62,13 +64,13 @@ impl Embedded {
         remove_if_there(&data.join("endpoint.json"))?;
 
         let (stop_coordinator, stopped) = oneshot::channel();
-        let running = start_coordinator(&data, &token_file, options.listen, stopped).await?;
+        let running = start_coordinator(&data, &token_file, options, stopped).await?;
         let url = running.url();
         let coordinator = tokio::spawn(async move {
             let ended = running.wait().await;
             ended.map_err(|error| Problem::failed(chain(&error)))
         });
-        let target = Target::new(&url, Some(&token_file))?;
+        let target = Target::new(&url, Some(&token_file), &ign_client::Files::default())?;
 
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = options
@@ -173,7 +175,7 @@ fn ended_early(ended: Result<Result<(), Problem>, tokio::task::JoinError>) -> Pr
 async fn start_coordinator(
     data: &Path,
     token_file: &Path,
-    listen: SocketAddr,
+    options: &Options,
     stopped: oneshot::Receiver<()>,
 ) -> Result<Running, Problem> {
     let text = |path: &Path| {
@@ -186,13 +188,15 @@ async fn start_coordinator(
         .replace('%', "%25")
         .replace('?', "%3F");
     let config = ign_coordinator::Config {
-        listen,
+        listen: options.listen,
         database: format!("sqlite://{database}"),
         store: StoreConfig::new(format!("file://{}", text(&data.join("store"))?)),
         token_file: token_file.to_path_buf(),
         endpoint_file: Some(data.join("endpoint.json")),
         settings: ign_queue::Settings::default(),
         redirect_blobs: false,
+        tls: None,
+        behind_tls_proxy: options.behind_tls_proxy,
         limits: ign_coordinator::Limits::default(),
     };
     let shutdown = async {

@@ -80,6 +80,14 @@ impl Client {
         }
     }
 
+    /// The same with more options.
+    #[must_use]
+    pub fn with(mut self, options: &[&str]) -> Self {
+        self.connection
+            .extend(options.iter().map(ToString::to_string));
+        self
+    }
+
     /// The command `ignctl ARGS`, to be run by the caller.
     pub fn command(&self, args: &[&str]) -> Result<Command> {
         let mut command = Command::new(program("ignctl")?);

@@ -1,7 +1,7 @@
 //! `ign-worker agent`: runs `ign_agent` with this program's `exec` as the child.
 
 use std::io::Read;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
 use bytesize::ByteSize;
@@ -14,12 +14,36 @@ use crate::{gpu, output};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Options {
-    /// The coordinator, http://HOST:PORT.
+    /// The coordinator, https://HOST:PORT; http:// within one machine.
     #[arg(long, env = "IGN_SERVER", value_name = "URL")]
     server: String,
     /// File that holds the bearer token.
-    #[arg(long, env = "IGN_TOKEN_FILE", value_name = "FILE")]
-    token_file: PathBuf,
+    #[arg(
+        long,
+        env = "IGN_TOKEN_FILE",
+        value_name = "FILE",
+        required_unless_present = "client_cert"
+    )]
+    token_file: Option<PathBuf>,
+    /// Authorities of the coordinator's certificate, in PEM [default: those of this machine].
+    #[arg(long, env = "IGN_CA_FILE", value_name = "FILE")]
+    ca_file: Option<PathBuf>,
+    /// Certificate of this worker in PEM, in place of a token.
+    #[arg(
+        long,
+        env = "IGN_CLIENT_CERT",
+        value_name = "FILE",
+        requires = "client_key"
+    )]
+    client_cert: Option<PathBuf>,
+    /// Its key in PEM.
+    #[arg(
+        long,
+        env = "IGN_CLIENT_KEY",
+        value_name = "FILE",
+        requires = "client_cert"
+    )]
+    client_key: Option<PathBuf>,
     /// Folder for cached captures and running jobs; belongs to this agent alone.
     #[arg(long, env = "IGN_WORK_DIR", value_name = "DIR")]
     work_dir: PathBuf,
@@ -51,11 +75,10 @@ pub(crate) fn run(options: Options) -> Result<()> {
         .with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr()))
         .with_target(false)
         .init();
-    let token_file = options.token_file.display();
-    let token = std::fs::read_to_string(&options.token_file)
-        .with_context(|| format!("cannot read the token file {token_file}"))?;
-    let token = token.trim();
-    ensure!(!token.is_empty(), "the token file {token_file} is empty");
+    let token = match &options.token_file {
+        Some(file) => read_token(file)?,
+        None => String::new(),
+    };
 
     let shutdown = CancellationToken::new();
     if options.exit_when_stdin_closes {
@@ -68,7 +91,11 @@ pub(crate) fn run(options: Options) -> Result<()> {
             })?;
     }
     let gpu = gpu::probe();
-    let mut config = AgentConfig::new(&options.server, token, &options.work_dir)?;
+    let mut config = AgentConfig::new(&options.server, &token, &options.work_dir)?;
+    config.certificates = ign_client::Files {
+        ca: options.ca_file,
+        identity: options.client_cert.zip(options.client_key),
+    };
     config.name = options.name;
     config.device = gpu.name;
     env!("CARGO_PKG_VERSION").clone_into(&mut config.version);
@@ -93,6 +120,15 @@ pub(crate) fn run(options: Options) -> Result<()> {
             ));
             Ok(ign_agent::run(config, shutdown).await?)
         })
+}
+
+fn read_token(file: &Path) -> Result<String> {
+    let shown = file.display();
+    let text = std::fs::read_to_string(file)
+        .with_context(|| format!("cannot read the token file {shown}"))?;
+    let token = text.trim();
+    ensure!(!token.is_empty(), "the token file {shown} is empty");
+    Ok(token.to_owned())
 }
 
 /// The first signal asks for an orderly end, a second one does not wait for it.

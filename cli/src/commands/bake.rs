@@ -165,6 +165,7 @@ async fn connect(context: &Context) -> Result<(Connection, Option<Embedded>), Pr
             workers: 1,
             threads: None,
             listen: std::net::SocketAddr::from(([127, 0, 0, 1], 0)),
+            behind_tls_proxy: false,
             own: true,
         };
         match Embedded::start(&options).await {

@@ -19,6 +19,9 @@ pub(crate) struct Args {
     /// Address to listen on; port 0 takes a free one
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
     listen: SocketAddr,
+    /// Listen beyond this machine without TLS, because a proxy in front speaks it
+    #[arg(long)]
+    behind_tls_proxy: bool,
 }
 
 fn workers(text: &str) -> Result<usize, String> {
@@ -41,14 +44,10 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
         workers: args.workers,
         threads: args.threads,
         listen: args.listen,
+        behind_tls_proxy: args.behind_tls_proxy,
         own: false,
     };
     let mut service = Embedded::start(&options).await?;
-    if !args.listen.ip().is_loopback() {
-        output::warn(
-            "listening beyond this machine without TLS: anyone on the way can read the token",
-        );
-    }
     let plural =
         |count: usize, noun: &str| format!("{count} {noun}{}", if count == 1 { "" } else { "s" });
     let facts = output::pairs(&[

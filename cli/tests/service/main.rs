@@ -528,3 +528,72 @@ fn ctrl_c_cancels_the_job_of_a_bake_of_its_own() {
     let jobs = json(&service.run(&["jobs", "list", "-o", "json"]));
     assert_eq!(jobs[0]["state"], "cancelled");
 }
+
+#[test]
+fn tokens_are_made_used_rotated_and_revoked() {
+    let service = Service::start();
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("reader");
+    let file = file.to_str().unwrap();
+    let create = [
+        "token",
+        "create",
+        "reader",
+        "--allow",
+        "read:museum",
+        "--expires",
+        "1h",
+        "--out",
+        file,
+    ];
+    let made = service.run(&create);
+    assert_eq!(made.status.code(), Some(0), "{}", stderr(&made));
+    let secret = std::fs::read_to_string(file).unwrap();
+    assert!(secret.starts_with("ign_"));
+    // No place, no token.
+    let again = [
+        "token", "create", "other", "--allow", "read:*", "--out", file,
+    ];
+    assert_eq!(service.run(&again).status.code(), Some(2));
+    let listed = service.run(&["token", "list", "-o", "json"]);
+    for output in [&made, &listed] {
+        assert!(!stdout(output).contains(secret.trim()) && !stderr(output).contains(secret.trim()));
+    }
+    let listed: serde_json::Value = serde_json::from_str(&stdout(&listed)).unwrap();
+    assert_eq!(listed.as_array().unwrap().len(), 1);
+    assert_eq!(
+        (&listed[0]["allows"][0], &listed[0]["state"]),
+        (&"read:museum".into(), &"ok".into())
+    );
+
+    let list_jobs = || {
+        service.run(&[
+            "--token-file",
+            file,
+            "jobs",
+            "list",
+            "--collection",
+            "museum",
+        ])
+    };
+    assert_eq!(list_jobs().status.code(), Some(0));
+    let refused = service.run(&["--token-file", file, "token", "list"]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(
+        stderr(&refused).contains("it takes admin in every collection"),
+        "{}",
+        stderr(&refused)
+    );
+
+    // The secret alone on stdout, to be piped.
+    let rotated = service.run(&["token", "rotate", "reader", "--grace", "0s"]);
+    assert_eq!(rotated.status.code(), Some(0), "{}", stderr(&rotated));
+    assert_eq!(list_jobs().status.code(), Some(1));
+    std::fs::write(file, &rotated.stdout).unwrap();
+    assert_eq!(list_jobs().status.code(), Some(0));
+    assert_eq!(
+        service.run(&["token", "revoke", "reader"]).status.code(),
+        Some(0)
+    );
+    assert_eq!(list_jobs().status.code(), Some(1));
+}

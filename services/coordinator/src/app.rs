@@ -8,6 +8,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::auth::Doorkeeper;
 use crate::fetch::Contents;
+use crate::limits::Limits;
 use crate::metrics::Metrics;
 use crate::publish::Mirror;
 
@@ -17,6 +18,7 @@ pub(crate) struct App {
     pub(crate) registry: Registry,
     pub(crate) doorkeeper: Doorkeeper,
     pub(crate) contents: Contents,
+    pub(crate) limits: Limits,
     pub(crate) metrics: Metrics,
     pub(crate) mirror: Mirror,
     pub(crate) redirect_blobs: bool,

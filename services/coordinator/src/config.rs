@@ -7,6 +7,7 @@ use ign_queue::{Settings, StoreError};
 use ign_registry::{RegistryError, StoreConfig};
 
 use crate::limits::Limits;
+use crate::tls::TlsFiles;
 
 /// Settings of one coordinator.
 #[derive(Clone, Debug)]
@@ -26,6 +27,10 @@ pub struct Config {
     /// Answer blob reads with a redirect to a signed URL where the store can sign. Clients must be able to reach the
     /// store under the same address.
     pub redirect_blobs: bool,
+    /// Certificates; none for plain HTTP, which is for this machine alone unless [`Config::behind_tls_proxy`].
+    pub tls: Option<TlsFiles>,
+    /// A proxy in front speaks TLS with clients and says in `X-Forwarded-For` who they are.
+    pub behind_tls_proxy: bool,
     /// What a peer may cost.
     pub limits: Limits,
 }
@@ -40,6 +45,22 @@ pub enum ServeError {
         path: PathBuf,
         /// What is wrong.
         reason: String,
+    },
+    /// Tokens would cross a network for all to read.
+    #[error(
+        "{address} is beyond this machine and would be served without TLS; give --tls-cert and --tls-key, or say \
+         --behind-tls-proxy if a proxy speaks TLS in front"
+    )]
+    PlainHttp {
+        /// As configured.
+        address: SocketAddr,
+    },
+    /// The certificates are absent or unusable.
+    #[error("cannot use the certificates")]
+    Tls {
+        /// What is wrong.
+        #[source]
+        source: ign_client::Error,
     },
     /// The address cannot be listened on.
     #[error("cannot listen on {address}")]

@@ -9,13 +9,12 @@
 //! GET                    /v2/{c}/{o}/tags/list                      versions and aliases
 //! ```
 //!
-//! Limits: a blob of [`MAX_BLOB_BYTES`], a manifest of 4 MiB, [`IDLE`] between two pieces of a body. Memory is bounded
+//! Limits: a blob of [`MAX_BLOB_BYTES`], a manifest of 4 MiB, slow bodies as [`crate::body`] says. Memory is bounded
 //! by a few parts per upload.
 
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::{Path, Query, Request, State};
@@ -34,7 +33,6 @@ use ign_proto::{Cause, Digest, IdError, Kind, Manifest, ObjectName};
 use ign_queue::VersionFilter;
 use ign_registry::{BodyError, RegistryError, UploadId};
 use serde::Deserialize;
-use tokio_stream::StreamExt as _;
 
 use crate::access::Caller;
 use crate::app::App;
@@ -44,8 +42,6 @@ use crate::http_answer::{Refused, oci_error};
 use crate::limits::{MAX_BLOB_BYTES, SIGNED_FOR};
 use crate::trace;
 
-/// Longest silence in the middle of a body.
-const IDLE: Duration = Duration::from_mins(1);
 const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 const UPLOAD_UUID: HeaderName = HeaderName::from_static("docker-upload-uuid");
 
@@ -392,28 +388,19 @@ async fn append(
     Ok(appended.await.map_err(|error| internal(&error))?)
 }
 
-/// The body in pieces, counted, with a limit on silence.
+/// The body in pieces, counted.
 fn pieces(
     app: &Arc<App>,
     request: Request,
 ) -> impl Stream<Item = Result<Bytes, BodyError>> + Send + use<> {
     let app = app.clone();
-    let body = request
-        .into_body()
-        .into_data_stream()
-        .timeout(IDLE)
-        .map(|piece| match piece {
-            Ok(piece) => piece.map_err(BodyError::from),
-            Err(_elapsed) => Err(BodyError::from(format!(
-                "nothing came for {} s",
-                IDLE.as_secs()
-            ))),
-        });
-    body.inspect_ok(move |piece: &Bytes| {
-        app.metrics
-            .bytes_received
-            .fetch_add(piece.len() as u64, Ordering::Relaxed);
-    })
+    let body = request.into_body().into_data_stream();
+    body.map_err(BodyError::from)
+        .inspect_ok(move |piece: &Bytes| {
+            app.metrics
+                .bytes_received
+                .fetch_add(piece.len() as u64, Ordering::Relaxed);
+        })
 }
 
 /// First byte of `Content-Range: 5-9`, also with HTTP's own `bytes ` before it and `/10` behind.

@@ -1,7 +1,7 @@
 //! Coordinator: gRPC control plane and HTTP data plane on one port.
 //!
 //! ```text
-//!             one port, h2c and HTTP/1.1
+//!             one port, HTTP/2 and HTTP/1.1, TLS or not
 //!   trace -> cors -> auth -+-> ign.v1 (jobs, workers, bundles, tokens, ...) -> ign-queue (database)
 //!                          +-> /v2/... blobs and manifests (data_plane)     -> ign-registry (bucket)
 //!                          +-> /healthz /readyz /metrics, gRPC health and reflection
@@ -17,9 +17,11 @@
 mod access;
 mod app;
 mod auth;
+mod body;
 mod bundles;
 mod collections;
 mod config;
+mod connections;
 mod convert;
 mod data_plane;
 mod error;
@@ -33,6 +35,7 @@ mod operations;
 mod publish;
 mod server;
 mod throttle;
+mod tls;
 mod token;
 mod tokens;
 mod trace;
@@ -41,3 +44,4 @@ mod workers;
 pub use config::{Config, ServeError};
 pub use limits::{Limits, Rate};
 pub use server::{Running, serve};
+pub use tls::TlsFiles;

@@ -53,7 +53,7 @@ impl Default for Limits {
             connections_per_peer: 1024,
             first_request: Duration::from_secs(15),
             head: Duration::from_mins(2),
-            head_bytes: 16 * 1024,
+            head_bytes: 64 * 1024,
             body_silence: Duration::from_mins(1),
             body_bytes_per_sec: 1024,
             failures: Rate {

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Parser, ValueEnum};
-use ign_coordinator::{Config, Limits, serve};
+use ign_coordinator::{Config, Limits, TlsFiles, serve};
 use ign_queue::Settings;
 use ign_registry::StoreConfig;
 use tokio::signal::unix::{SignalKind, signal};
@@ -32,6 +32,20 @@ struct Args {
     /// File with the root token, which allows everything; `ignctl token create` makes others.
     #[arg(long, env = "IGN_TOKEN_FILE")]
     token_file: PathBuf,
+    /// Certificate of this server in PEM, with those between it and its authority; read again when it changes and on
+    /// SIGHUP.
+    #[arg(long, env = "IGN_TLS_CERT", requires = "tls_key")]
+    tls_cert: Option<PathBuf>,
+    /// Its key in PEM.
+    #[arg(long, env = "IGN_TLS_KEY", requires = "tls_cert")]
+    tls_key: Option<PathBuf>,
+    /// Authority of workers' certificates in PEM: whoever shows one that it signed may work, without a token.
+    #[arg(long, env = "IGN_CLIENT_CA", requires = "tls_cert")]
+    client_ca: Option<PathBuf>,
+    /// A proxy in front speaks TLS: listen beyond this machine without it, and take clients' addresses from the last
+    /// X-Forwarded-For.
+    #[arg(long, env = "IGN_BEHIND_TLS_PROXY")]
+    behind_tls_proxy: bool,
     /// Where to write url, pid and token file as JSON once listening.
     #[arg(long, env = "IGN_ENDPOINT_FILE")]
     endpoint_file: Option<PathBuf>,
@@ -100,6 +114,12 @@ async fn run(args: Args) -> anyhow::Result<()> {
             ..Settings::default()
         },
         redirect_blobs: args.redirect_blobs,
+        tls: args.tls_cert.zip(args.tls_key).map(|(cert, key)| TlsFiles {
+            cert,
+            key,
+            client_ca: args.client_ca,
+        }),
+        behind_tls_proxy: args.behind_tls_proxy,
         limits: Limits::default(),
     };
     let shutdown = async move {
@@ -109,6 +129,14 @@ async fn run(args: Args) -> anyhow::Result<()> {
         }
         tracing::info!("asked to stop");
     };
-    serve(config, shutdown).await?.wait().await?;
+    let running = serve(config, shutdown).await?;
+    let reload = running.reload_certificates();
+    let mut hangup = signal(SignalKind::hangup())?;
+    tokio::spawn(async move {
+        while hangup.recv().await.is_some() {
+            reload();
+        }
+    });
+    running.wait().await?;
     Ok(())
 }

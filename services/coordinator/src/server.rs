@@ -1,25 +1,19 @@
 //! Listening, serving, ending.
 //!
 //! Ending is a future that the caller passes in. Then: long polls and streams end, readiness turns false, no new
-//! connection is taken, what runs may finish within [`GRACE`].
+//! connection is taken, what runs may finish within a grace; see [`crate::connections`].
 
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
 
 use axum::Router;
-use axum::extract::Request;
 use axum::http::header::{
     AUTHORIZATION, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_NONE_MATCH, LOCATION,
     RANGE,
 };
 use axum::http::{HeaderMap, HeaderName, Method};
-use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
-use hyper_util::server::conn::auto;
-use hyper_util::server::graceful::GracefulShutdown;
-use hyper_util::service::TowerToHyperService;
 use ign_proto::v1::bundles_server::BundlesServer;
 use ign_proto::v1::collections_server::CollectionsServer;
 use ign_proto::v1::jobs_server::JobsServer;
@@ -28,18 +22,19 @@ use ign_proto::v1::workers_server::WorkersServer;
 use ign_proto::{MAX_MESSAGE_BYTES, v1};
 use ign_registry::Registry;
 use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
-use tokio::task::{JoinHandle, JoinSet};
+use tokio::sync::Notify;
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic_health::server::HealthReporter;
-use tower::ServiceExt as _;
 use tower_http::cors::{Any, CorsLayer};
 
 use crate::app::App;
-use crate::auth::{self, Doorkeeper, Peer};
+use crate::auth::{self, Doorkeeper};
+use crate::body;
 use crate::bundles::BundlesApi;
 use crate::collections::CollectionsApi;
 use crate::config::{Config, ServeError};
+use crate::connections::Door;
 use crate::data_plane;
 use crate::fetch::Contents;
 use crate::http_answer::unknown;
@@ -48,26 +43,17 @@ use crate::maintenance;
 use crate::metrics::Metrics;
 use crate::operations;
 use crate::publish::Mirror;
+use crate::tls::Tls;
 use crate::tokens::TokensApi;
 use crate::trace;
 use crate::workers::WorkersApi;
-
-const MAX_CONNECTIONS: usize = 4096;
-const MAX_STREAMS: u32 = 1024;
-/// A peer that vanished is noticed after the sum of both.
-const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(15);
-const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(15);
-/// Longer than clients keep idle connections (reqwest: 90 s), or they would send into one that is closing.
-const HEADER_TIMEOUT: Duration = Duration::from_mins(2);
-const STREAM_WINDOW: u32 = 1024 * 1024;
-const CONNECTION_WINDOW: u32 = 8 * 1024 * 1024;
-/// How long running requests may take to end.
-const GRACE: Duration = Duration::from_secs(8);
 
 /// A coordinator that listens.
 #[derive(Debug)]
 pub struct Running {
     address: SocketAddr,
+    scheme: &'static str,
+    reload: Arc<Notify>,
     task: JoinHandle<Result<(), ServeError>>,
 }
 
@@ -79,7 +65,13 @@ impl Running {
 
     /// Its address as a URL.
     pub fn url(&self) -> String {
-        format!("http://{}", self.address)
+        format!("{}://{}", self.scheme, self.address)
+    }
+
+    /// What makes it read its certificates again at once; it also does so when they change.
+    pub fn reload_certificates(&self) -> impl Fn() + Send + Sync + use<> {
+        let reload = self.reload.clone();
+        move || reload.notify_one()
     }
 
     /// Waits until it has ended.
@@ -96,7 +88,17 @@ pub async fn serve(
     config: Config,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<Running, ServeError> {
-    let doorkeeper = Doorkeeper::new(&config.token_file, &config.limits, false)?;
+    let doorkeeper = Doorkeeper::new(&config.token_file, &config.limits, config.behind_tls_proxy)?;
+    let tls = config.tls.clone().map(Tls::load).transpose();
+    let tls = tls
+        .map_err(|source| ServeError::Tls { source })?
+        .map(Arc::new);
+    let scheme = if tls.is_some() { "https" } else { "http" };
+    if tls.is_none() && !config.behind_tls_proxy && !config.listen.ip().is_loopback() {
+        return Err(ServeError::PlainHttp {
+            address: config.listen,
+        });
+    }
     let registry = Registry::open(&config.store)
         .await
         .map_err(|source| ServeError::Registry { source })?;
@@ -109,11 +111,9 @@ pub async fn serve(
     };
     let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
     let address = listener.local_addr().map_err(listen)?;
-    if !address.ip().is_loopback() {
-        tracing::warn!(%address, "listening beyond this machine without TLS: put a proxy that speaks TLS in front");
-    }
     tracing::info!(
         %address,
+        scheme,
         store.url = config.store.url,
         store.conditional_create = registry.probe().conditional_create,
         store.signs_urls = registry.probe().signs_urls,
@@ -124,6 +124,7 @@ pub async fn serve(
         registry,
         doorkeeper,
         contents: Contents::default(),
+        limits: config.limits,
         metrics: Metrics::default(),
         mirror: Mirror::default(),
         redirect_blobs: config.redirect_blobs,
@@ -131,13 +132,15 @@ pub async fn serve(
     });
     let (health, router) = router(&app).await;
     if let Some(path) = &config.endpoint_file {
-        write_endpoint(path, address, &config.token_file).map_err(|source| {
+        write_endpoint(path, scheme, address, &config.token_file).map_err(|source| {
             ServeError::Endpoint {
                 path: path.clone(),
                 source,
             }
         })?;
     }
+    let reload = Arc::new(Notify::new());
+    let asked = reload.clone();
     let task = tokio::spawn(async move {
         tokio::spawn({
             let stopping = app.stopping.clone();
@@ -150,10 +153,24 @@ pub async fn serve(
             let app = app.clone();
             async move { maintenance::run(&app).await }
         });
-        accept(&app, listener, router, &health).await;
-        maintenance
-            .await
-            .map_err(|source| ServeError::Task { source })?;
+        let certificates = tokio::spawn({
+            let (app, tls, reload) = (app.clone(), tls.clone(), reload.clone());
+            async move {
+                if let Some(tls) = tls {
+                    tls.follow(&reload, &app.stopping).await;
+                }
+            }
+        });
+        let closing = async {
+            health.set_not_serving::<JobsServer<JobsApi>>().await;
+            health.set_not_serving::<WorkersServer<WorkersApi>>().await;
+        };
+        Door::new(router, tls, &app.limits, config.behind_tls_proxy)
+            .run(listener, &app.stopping, closing)
+            .await;
+        for task in [maintenance, certificates] {
+            task.await.map_err(|source| ServeError::Task { source })?;
+        }
         if let Some(path) = &config.endpoint_file
             && let Err(error) = std::fs::remove_file(path)
         {
@@ -162,7 +179,12 @@ pub async fn serve(
         tracing::info!("coordinator ended");
         Ok(())
     });
-    Ok(Running { address, task })
+    Ok(Running {
+        address,
+        scheme,
+        reload: asked,
+        task,
+    })
 }
 
 async fn router(app: &Arc<App>) -> (HealthReporter, Router) {
@@ -221,6 +243,10 @@ async fn router(app: &Arc<App>) -> (HealthReporter, Router) {
         .fallback(|headers: HeaderMap| async move { unknown(&headers) })
         .layer(axum::middleware::from_fn_with_state(
             app.clone(),
+            body::layer,
+        ))
+        .layer(axum::middleware::from_fn_with_state(
+            app.clone(),
             auth::layer,
         ))
         .layer(cors)
@@ -231,87 +257,16 @@ async fn router(app: &Arc<App>) -> (HealthReporter, Router) {
     (health, router)
 }
 
-/// Takes connections until the coordinator is to stop, then lets them finish.
-async fn accept(app: &App, listener: TcpListener, router: Router, health: &HealthReporter) {
-    let mut server = auto::Builder::new(TokioExecutor::new());
-    server
-        .http1()
-        .timer(TokioTimer::new())
-        .header_read_timeout(HEADER_TIMEOUT);
-    server
-        .http2()
-        .timer(TokioTimer::new())
-        .keep_alive_interval(KEEP_ALIVE_INTERVAL)
-        .keep_alive_timeout(KEEP_ALIVE_TIMEOUT)
-        .max_concurrent_streams(MAX_STREAMS)
-        .initial_stream_window_size(STREAM_WINDOW)
-        .initial_connection_window_size(CONNECTION_WINDOW);
-    let graceful = GracefulShutdown::new();
-    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
-    let mut connections = JoinSet::new();
-    loop {
-        let accepted = tokio::select! {
-            biased;
-            () = app.stopping.cancelled() => break,
-            // Connections that have ended are collected as others come.
-            Some(_ended) = connections.join_next() => continue,
-            accepted = listener.accept() => accepted,
-        };
-        let (socket, peer) = match accepted {
-            Ok(accepted) => accepted,
-            Err(error) => {
-                // Out of file handles, or the peer left: the next one may do.
-                tracing::warn!(%error, "could not take a connection");
-                tokio::time::sleep(Duration::from_millis(50)).await;
-                continue;
-            }
-        };
-        let Ok(place) = places.clone().try_acquire_owned() else {
-            tracing::warn!(%peer, "refused a connection: {MAX_CONNECTIONS} are open");
-            continue;
-        };
-        if let Err(error) = socket.set_nodelay(true) {
-            tracing::debug!(%error, %peer, "peer left at once");
-            continue;
-        }
-        let service = router.clone().map_request(move |mut request: Request<_>| {
-            request.extensions_mut().insert(Peer {
-                address: peer,
-                certificate: None,
-            });
-            request
-        });
-        let connection = server
-            .serve_connection(TokioIo::new(socket), TowerToHyperService::new(service))
-            .into_owned();
-        let connection = graceful.watch(connection);
-        connections.spawn(async move {
-            if let Err(error) = connection.await {
-                tracing::debug!(error, %peer, "connection broke");
-            }
-            drop(place);
-        });
-    }
-    drop(listener);
-    health.set_not_serving::<JobsServer<JobsApi>>().await;
-    health.set_not_serving::<WorkersServer<WorkersApi>>().await;
-    if tokio::time::timeout(GRACE, graceful.shutdown())
-        .await
-        .is_err()
-    {
-        tracing::warn!(
-            "cutting connections that did not end within {} s",
-            GRACE.as_secs()
-        );
-    }
-    connections.shutdown().await;
-}
-
 /// Says where we listen. Readers see the whole file or none: it is written aside and renamed.
-fn write_endpoint(path: &Path, address: SocketAddr, token_file: &Path) -> std::io::Result<()> {
+fn write_endpoint(
+    path: &Path,
+    scheme: &str,
+    address: SocketAddr,
+    token_file: &Path,
+) -> std::io::Result<()> {
     let token_file = std::path::absolute(token_file)?;
     let endpoint = serde_json::json!({
-        "url": format!("http://{address}"),
+        "url": format!("{scheme}://{address}"),
         "pid": std::process::id(),
         "token_file": token_file.display().to_string(),
     });

@@ -17,15 +17,17 @@ const DEADLINE: Duration = Duration::from_secs(15);
 /// Publishing checks every blob in the store.
 const COMPLETE_DEADLINE: Duration = Duration::from_mins(2);
 
-/// Adds the bearer token to every call.
+/// Adds the bearer token, where there is one, to every call.
 #[derive(Clone, Debug)]
-struct Bearer(MetadataValue<Ascii>);
+struct Bearer(Option<MetadataValue<Ascii>>);
 
 impl Interceptor for Bearer {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
-        request
-            .metadata_mut()
-            .insert("authorization", self.0.clone());
+        if let Some(token) = &self.0 {
+            request
+                .metadata_mut()
+                .insert("authorization", token.clone());
+        }
         Ok(request)
     }
 }
@@ -37,12 +39,17 @@ pub(crate) struct Control {
 }
 
 impl Control {
-    pub(crate) fn new(server: &Url, token: &str) -> Result<Self, AgentError> {
+    pub(crate) fn new(
+        server: &Url,
+        token: &str,
+        tls: &ign_client::Tls,
+    ) -> Result<Self, AgentError> {
         let mut value: MetadataValue<Ascii> = format!("Bearer {token}")
             .parse()
             .map_err(|_invalid| AgentError::Token)?;
         value.set_sensitive(true);
-        let channel = Endpoint::from_shared(server.to_string())
+        let bearer = Bearer((!token.is_empty()).then_some(value));
+        let endpoint = Endpoint::from_shared(server.to_string())
             .map_err(|error| AgentError::Server {
                 url: server.to_string(),
                 reason: error.to_string(),
@@ -51,10 +58,8 @@ impl Control {
             // A peer that vanished without a word is noticed within this time, also during a long poll.
             .http2_keep_alive_interval(Duration::from_secs(10))
             .keep_alive_timeout(Duration::from_secs(10))
-            .keep_alive_while_idle(true)
-            .tcp_nodelay(true)
-            .connect_lazy();
-        let client = WorkersClient::with_interceptor(channel, Bearer(value))
+            .keep_alive_while_idle(true);
+        let client = WorkersClient::with_interceptor(tls.channel(&endpoint), bearer)
             .max_decoding_message_size(MAX_MESSAGE_BYTES);
         Ok(Self { client })
     }

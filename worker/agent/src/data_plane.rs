@@ -77,12 +77,18 @@ impl UploadSession {
 }
 
 impl DataPlane {
-    pub(crate) fn new(server: &Url, token: &str) -> Result<Self, AgentError> {
+    pub(crate) fn new(
+        server: &Url,
+        token: &str,
+        tls: &ign_client::Tls,
+    ) -> Result<Self, AgentError> {
         let mut value = HeaderValue::from_str(&format!("Bearer {token}"))
             .map_err(|_invalid| AgentError::Token)?;
         value.set_sensitive(true);
-        let http = reqwest::Client::builder()
-            .default_headers(HeaderMap::from_iter([(AUTHORIZATION, value)]))
+        let bearer = (!token.is_empty()).then_some((AUTHORIZATION, value));
+        let http = tls
+            .http(reqwest::Client::builder())
+            .default_headers(HeaderMap::from_iter(bearer))
             .connect_timeout(Duration::from_secs(5))
             .read_timeout(Duration::from_secs(30))
             .tcp_keepalive(Duration::from_secs(20))

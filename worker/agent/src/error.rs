@@ -18,6 +18,13 @@ pub enum AgentError {
     /// The token cannot be a header value.
     #[error("the token holds characters that a header cannot carry")]
     Token,
+    /// The certificates are absent or unusable.
+    #[error("cannot use the certificates")]
+    Certificates {
+        /// What is wrong.
+        #[source]
+        source: ign_client::Error,
+    },
     /// The given name of this worker breaks the rules for names.
     #[error("the worker's name is not usable")]
     Name {

@@ -46,10 +46,12 @@ use crate::job::Next;
 /// How one agent works.
 #[derive(Clone, Debug)]
 pub struct AgentConfig {
-    /// `http://host:port` of the coordinator.
+    /// `https://host:port` of the coordinator, or `http://` within one machine.
     pub server: String,
-    /// Bearer token.
+    /// Bearer token; empty where a certificate says who this is.
     pub token: String,
+    /// Certificates for TLS.
+    pub certificates: ign_client::Files,
     /// Folder for cached captures and running jobs; belongs to this agent alone.
     pub work_dir: PathBuf,
     /// Name of this worker; made from host name and process id when absent.
@@ -79,6 +81,7 @@ impl AgentConfig {
         Ok(Self {
             server: server.to_owned(),
             token: token.to_owned(),
+            certificates: ign_client::Files::default(),
             work_dir: work_dir.to_path_buf(),
             name: None,
             threads: std::thread::available_parallelism().map_or(1, usize::from),
@@ -171,9 +174,11 @@ impl Agent {
             reason: reason.to_owned(),
         };
         let server = Url::parse(&config.server).map_err(|error| unusable(&error.to_string()))?;
-        if server.scheme() != "http" {
-            return Err(unusable("it must begin with http://"));
+        if !matches!(server.scheme(), "http" | "https") {
+            return Err(unusable("it must begin with https:// or http://"));
         }
+        let tls = ign_client::Tls::load(&config.certificates)
+            .map_err(|source| AgentError::Certificates { source })?;
         let hostname = rustix::system::uname()
             .nodename()
             .to_string_lossy()
@@ -211,8 +216,8 @@ impl Agent {
         let cache =
             Cache::open(&work_dir.join("cache"), config.cache_bytes).map_err(in_work_dir)?;
         Ok(Self {
-            control: Control::new(&server, &config.token)?,
-            data: DataPlane::new(&server, &config.token)?,
+            control: Control::new(&server, &config.token, &tls)?,
+            data: DataPlane::new(&server, &config.token, &tls)?,
             cache,
             jobs_dir,
             worker,

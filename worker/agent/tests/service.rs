@@ -58,6 +58,8 @@ impl Service {
                 },
                 poll: Duration::from_millis(100),
             },
+            tls: None,
+            behind_tls_proxy: false,
             limits: ign_coordinator::Limits::default(),
             redirect_blobs: true,
         };

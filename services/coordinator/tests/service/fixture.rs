@@ -85,6 +85,8 @@ impl Service {
             endpoint_file: Some(folder.join("endpoint.json")),
             settings: settings(Duration::from_secs(45)),
             redirect_blobs: true,
+            tls: None,
+            behind_tls_proxy: false,
             limits: Limits::default(),
         };
         change(&mut config);
@@ -111,6 +113,18 @@ impl Service {
             running: Some((running, stop)),
             _keep: keep,
         }
+    }
+
+    /// Its settings, changed.
+    pub(crate) fn config(&self, change: impl FnOnce(&mut Config)) -> Config {
+        let mut config = self.config.clone();
+        change(&mut config);
+        config
+    }
+
+    /// As SIGHUP does.
+    pub(crate) fn reload_certificates(&self) {
+        self.running.as_ref().unwrap().0.reload_certificates()();
     }
 
     /// Stops the coordinator and waits for its end.

@@ -5,5 +5,7 @@ mod auth;
 mod data_plane;
 mod fixture;
 mod life;
+mod limits;
 mod oci;
 mod operations;
+mod tls;

@@ -120,6 +120,8 @@ async fn a_coordinator_that_cannot_work_says_why() {
             token_file: token.clone(),
             endpoint_file: None,
             settings: ign_queue::Settings::default(),
+            tls: None,
+            behind_tls_proxy: false,
             limits: ign_coordinator::Limits::default(),
             redirect_blobs: false,
         };
