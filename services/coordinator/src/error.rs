@@ -68,7 +68,7 @@ impl From<RegistryError> for Refused {
             },
             RegistryError::Body { .. }
             | RegistryError::TooLarge { .. }
-            | RegistryError::WrongOffset { .. } => Cause::bad_field("body", error),
+            | RegistryError::WrongOffset { .. } => Cause::bad_field("body", chain(&error)),
             RegistryError::Store { .. } => {
                 unavailable("the object store cannot be reached", &error)
             }

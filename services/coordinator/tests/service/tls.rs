@@ -188,7 +188,11 @@ async fn a_certificate_makes_a_worker_and_nothing_more() {
         .lease(lease())
         .await
         .unwrap_err();
-    assert_eq!(refused.code(), Code::Unavailable);
+    // The refusal comes after the client's own handshake has ended: as a broken connection.
+    assert!(
+        matches!(refused.code(), Code::Unavailable | Code::Unknown),
+        "{refused}"
+    );
 }
 
 #[tokio::test]
