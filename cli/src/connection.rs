@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use ign_proto::MAX_MESSAGE_BYTES;
+use ign_proto::v1::admin_client::AdminClient;
 use ign_proto::v1::bundles_client::BundlesClient;
 use ign_proto::v1::collections_client::CollectionsClient;
 use ign_proto::v1::jobs_client::JobsClient;
@@ -293,6 +294,11 @@ impl Connection {
     /// Client of the token calls.
     pub(crate) fn tokens(&self) -> TokensClient<Admitted> {
         TokensClient::new(self.admitted())
+    }
+
+    /// Client of the calls about the registry as a whole.
+    pub(crate) fn admin(&self) -> AdminClient<Admitted> {
+        AdminClient::new(self.admitted()).max_decoding_message_size(MAX_MESSAGE_BYTES)
     }
 
     /// Client of the blobs of one object.

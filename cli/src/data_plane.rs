@@ -432,7 +432,8 @@ async fn checked(answer: Response) -> Result<Response, Refusal> {
     if status == StatusCode::NOT_FOUND {
         return Err(Refusal::Final(Problem::failed(NOT_FOUND).at(answer.url())));
     }
-    let passing = status.is_server_error()
+    // A full store does not become empty within seconds: that is said at once.
+    let passing = (status.is_server_error() && status != StatusCode::INSUFFICIENT_STORAGE)
         || matches!(
             status,
             StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS

@@ -198,6 +198,7 @@ async fn start_coordinator(
         tls: None,
         behind_tls_proxy: options.behind_tls_proxy,
         limits: ign_coordinator::Limits::default(),
+        care: ign_coordinator::Care::default(),
     };
     let shutdown = async {
         // Asked to stop, or the service was dropped: both mean stop.

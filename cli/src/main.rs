@@ -25,7 +25,7 @@ use std::process::ExitCode;
 use clap::{CommandFactory as _, Parser};
 
 use crate::commands::{
-    bake, bundle, collections, completions, doctor, jobs, status, submit, token, up,
+    admin, bake, bundle, collections, completions, doctor, jobs, status, submit, token, up,
 };
 use crate::connection::ConnectionArgs;
 use crate::output::Format;
@@ -88,6 +88,9 @@ enum Command {
     /// Make, list, rotate and revoke bearer tokens
     #[command(subcommand)]
     Token(token::Command),
+    /// Care for the registry as a whole: rebuild, collect garbage, audit
+    #[command(subcommand)]
+    Admin(admin::Command),
     /// Check that everything needed is there and works
     Doctor(doctor::Args),
     /// Print completions for a shell
@@ -155,6 +158,7 @@ async fn run(cli: Cli) -> Result<(), Problem> {
         Command::Collections(command) => collections::run(&context, &command).await,
         Command::Bundle(command) => bundle::run(&context, &command).await,
         Command::Token(command) => token::run(&context, &command).await,
+        Command::Admin(command) => admin::run(&context, &command).await,
         Command::Doctor(args) => doctor::run(&context, &args).await,
         Command::Completions(args) => completions::run(&args, &mut Cli::command()),
     }

@@ -16,6 +16,7 @@ use crate::ids::IdError;
 const DOMAIN: &str = "ign.v1";
 const KEY_REUSED: &str = "KEY_REUSED";
 const LEASE_LOST: &str = "LEASE_LOST";
+const FULL: &str = "FULL";
 const FORBIDDEN: &str = "FORBIDDEN";
 const NO_TOKEN: &str = "NO_TOKEN";
 
@@ -68,6 +69,11 @@ pub enum Cause {
     TooMany {
         /// When to try again.
         retry_after: Duration,
+    },
+    /// No room is left for new work; what runs goes on. `RESOURCE_EXHAUSTED`, `ErrorInfo` with reason `FULL`.
+    Full {
+        /// What is full, and what makes room.
+        message: String,
     },
     /// No token, or a wrong one. `UNAUTHENTICATED`, `ErrorInfo`.
     Unauthenticated,
@@ -151,6 +157,10 @@ impl Cause {
                 details.set_retry_info(Some(*retry_after));
                 Code::ResourceExhausted
             }
+            Self::Full { message } => {
+                info(&mut details, FULL, &[("message", message.clone())]);
+                Code::ResourceExhausted
+            }
             Self::Unauthenticated => {
                 info(&mut details, NO_TOKEN, &[]);
                 Code::Unauthenticated
@@ -210,6 +220,9 @@ impl Cause {
                 message: status.message().to_owned(),
                 retry_after: info.retry_delay.unwrap_or_default(),
             }),
+            (Code::ResourceExhausted, Some(FULL)) => Some(Self::Full {
+                message: field("message"),
+            }),
             // Without it: a message that is too large.
             (Code::ResourceExhausted, _) => details.retry_info().map(|info| Self::TooMany {
                 retry_after: info.retry_delay.unwrap_or_default(),
@@ -233,7 +246,10 @@ impl Cause {
     /// retried too.
     pub fn retryable(&self) -> bool {
         match self {
-            Self::Conflict | Self::Unavailable { .. } | Self::TooMany { .. } => true,
+            Self::Conflict
+            | Self::Unavailable { .. }
+            | Self::TooMany { .. }
+            | Self::Full { .. } => true,
             // A connection that broke shows as any of these; a server that has no such method, or refuses a message's
             // size, does not.
             Self::Transport { code, .. } => matches!(
@@ -269,6 +285,7 @@ impl Cause {
             Self::Conflict => "CONFLICT",
             Self::Unavailable { .. } => "UNAVAILABLE",
             Self::TooMany { .. } => "TOO_MANY",
+            Self::Full { .. } => FULL,
             Self::Unauthenticated => NO_TOKEN,
             Self::Forbidden { .. } => FORBIDDEN,
             Self::Internal { .. } => "INTERNAL",
@@ -286,7 +303,9 @@ impl fmt::Display for Cause {
             Self::LeaseLost { job, attempt } => {
                 write!(f, "attempt {attempt} no longer holds job {job}")
             }
-            Self::NotAllowed { message, .. } | Self::Forbidden { message } => f.write_str(message),
+            Self::NotAllowed { message, .. }
+            | Self::Full { message }
+            | Self::Forbidden { message } => f.write_str(message),
             Self::Conflict => f.write_str("another write came first; try again"),
             Self::Unavailable { message, .. } => write!(f, "{message}"),
             Self::TooMany { retry_after } => write!(
@@ -371,6 +390,13 @@ mod tests {
             (
                 Cause::TooMany {
                     retry_after: Duration::from_secs(3),
+                },
+                Code::ResourceExhausted,
+                true,
+            ),
+            (
+                Cause::Full {
+                    message: "the disk is full".into(),
                 },
                 Code::ResourceExhausted,
                 true,

@@ -1,4 +1,4 @@
-//! `bundle list|show|fetch|verify|tag`: versions of model bundles.
+//! `bundle list|show|fetch|verify|tag|retire|restore`: versions of model bundles.
 //!
 //! A bundle is named `collection/object`, with `:v3`, `:latest` or `@sha256:...` behind it where another than the
 //! latest is meant.
@@ -54,6 +54,16 @@ pub(crate) enum Command {
         /// Alias, such as approved
         alias: String,
     },
+    /// Take a version out of listings; its files stay for the grace of the next collections
+    Retire {
+        /// C/O:v3 or C/O@sha256:...
+        bundle: BundleRef,
+    },
+    /// Put a retired version back into listings
+    Restore {
+        /// C/O:v3 or C/O@sha256:...
+        bundle: BundleRef,
+    },
 }
 
 /// An object and which of its versions.
@@ -85,12 +95,15 @@ impl FromStr for BundleRef {
 }
 
 impl BundleRef {
-    async fn get(&self, connection: &Connection) -> Result<v1::BundleVersion, Problem> {
-        let request = v1::GetBundleRequest {
+    fn request(&self) -> v1::GetBundleRequest {
+        v1::GetBundleRequest {
             object: Some((&self.object).into()),
             reference: self.reference.clone(),
-        };
-        Ok(connection.bundles().get(request).await?.into_inner())
+        }
+    }
+
+    async fn get(&self, connection: &Connection) -> Result<v1::BundleVersion, Problem> {
+        Ok(connection.bundles().get(self.request()).await?.into_inner())
     }
 }
 
@@ -122,6 +135,18 @@ pub(crate) async fn run(context: &Context, command: &Command) -> Result<(), Prob
             };
             let view =
                 BundleView::from(&connection.bundles().set_alias(request).await?.into_inner());
+            output::data(context.format, &view, || table(std::slice::from_ref(&view)))
+        }
+        Command::Retire { bundle } => {
+            let connection = Connection::open(&context.connection).await?;
+            let retired = connection.bundles().retire(bundle.request()).await?;
+            let view = BundleView::from(&retired.into_inner());
+            output::data(context.format, &view, || table(std::slice::from_ref(&view)))
+        }
+        Command::Restore { bundle } => {
+            let connection = Connection::open(&context.connection).await?;
+            let restored = connection.bundles().restore(bundle.request()).await?;
+            let view = BundleView::from(&restored.into_inner());
             output::data(context.format, &view, || table(std::slice::from_ref(&view)))
         }
     }

@@ -112,8 +112,8 @@ fn state(text: &str) -> Result<v1::JobState, String> {
     }
 }
 
-/// `90`, `90s`, `10m`, `2h`.
-fn duration(text: &str) -> Result<Duration, String> {
+/// `90`, `90s`, `10m`, `2h`, `7d`.
+pub(crate) fn duration(text: &str) -> Result<Duration, String> {
     let (digits, unit) = match text.find(|c: char| !c.is_ascii_digit() && c != '.') {
         Some(at) => text.split_at(at),
         None => (text, "s"),
@@ -122,13 +122,14 @@ fn duration(text: &str) -> Result<Duration, String> {
         "s" => 1.0,
         "m" => 60.0,
         "h" => 3600.0,
-        _ => return Err("expected a time such as 90s, 10m or 2h".to_string()),
+        "d" => 24.0 * 3600.0,
+        _ => return Err("expected a time such as 90s, 10m, 2h or 7d".to_string()),
     };
     digits
         .parse::<f64>()
         .ok()
         .and_then(|count| Duration::try_from_secs_f64(count * scale).ok())
-        .ok_or_else(|| "expected a time such as 90s, 10m or 2h".to_string())
+        .ok_or_else(|| "expected a time such as 90s, 10m, 2h or 7d".to_string())
 }
 
 /// Finds the job that `name` names.

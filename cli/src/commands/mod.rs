@@ -1,5 +1,6 @@
 //! The commands, one file per group.
 
+pub(crate) mod admin;
 pub(crate) mod bake;
 pub(crate) mod bundle;
 pub(crate) mod collections;

@@ -32,7 +32,7 @@ fn help_and_usage_errors() {
     let help = run(&["--help"], &[]);
     assert_eq!(help.status.code(), Some(0));
     insta::assert_snapshot!(stdout(&help));
-    for command in ["up", "bake", "submit", "status", "wait", "bundle"] {
+    for command in ["up", "bake", "submit", "status", "wait", "bundle", "admin"] {
         let help = run(&[command, "--help"], &[]);
         assert_eq!(help.status.code(), Some(0), "{command}");
         insta::assert_snapshot!(format!("help_{command}"), stdout(&help));
@@ -596,4 +596,36 @@ fn tokens_are_made_used_rotated_and_revoked() {
         Some(0)
     );
     assert_eq!(list_jobs().status.code(), Some(1));
+}
+
+/// Collecting needs a yes; the rest can be run by a timer.
+#[test]
+fn an_operator_cares_for_the_registry() {
+    let service = Service::start();
+    let asked = service.run(&["admin", "gc"]);
+    assert_eq!(asked.status.code(), Some(1), "{}", stderr(&asked));
+    assert!(stderr(&asked).contains("--yes"), "{}", stderr(&asked));
+    let dry = json(&service.run(&["admin", "gc", "--dry-run", "-o", "json"]));
+    assert_eq!(dry["dry_run"], true);
+    assert_eq!(dry["trashed"]["objects"], 0);
+    let done = json(&service.run(&["admin", "gc", "--grace", "2h", "--yes", "-o", "json"]));
+    assert_eq!(done["dry_run"], false);
+    let short = service.run(&["admin", "gc", "--grace", "10m", "--dry-run"]);
+    assert!(
+        stderr(&short).contains("at least 3600 s"),
+        "{}",
+        stderr(&short)
+    );
+    let rebuilt = json(&service.run(&["admin", "rebuild-registry", "-o", "json"]));
+    assert_eq!(rebuilt["added"], 0);
+    let audit = json(&service.run(&["admin", "audit", "-o", "json"]));
+    assert_eq!(audit["read"]["objects"], 1, "OCI's empty config: {audit}");
+    let events = json(&service.run(&["admin", "events", "-o", "json"]));
+    let kinds: Vec<&str> = events
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|event| event["kind"].as_str().unwrap())
+        .collect();
+    assert_eq!(kinds, ["audit", "rebuild", "collect"]);
 }

@@ -66,6 +66,7 @@ pub(crate) const TABLE: &[(&str, &str, Need)] = &[
     ("POST", "/ign.v1.Bundles/Get", READ),
     ("POST", "/ign.v1.Bundles/SetAlias", ADMIN),
     ("POST", "/ign.v1.Bundles/Retire", ADMIN),
+    ("POST", "/ign.v1.Bundles/Restore", ADMIN),
     ("POST", "/ign.v1.Collections/List", READ),
     ("POST", "/ign.v1.Collections/Set", ADMIN),
     (
@@ -86,6 +87,26 @@ pub(crate) const TABLE: &[(&str, &str, Need)] = &[
     (
         "POST",
         "/ign.v1.Tokens/Revoke",
+        Need::Everywhere(Scope::Admin),
+    ),
+    (
+        "POST",
+        "/ign.v1.Admin/RebuildRegistry",
+        Need::Everywhere(Scope::Admin),
+    ),
+    (
+        "POST",
+        "/ign.v1.Admin/CollectGarbage",
+        Need::Everywhere(Scope::Admin),
+    ),
+    (
+        "POST",
+        "/ign.v1.Admin/AuditRegistry",
+        Need::Everywhere(Scope::Admin),
+    ),
+    (
+        "POST",
+        "/ign.v1.Admin/ListEvents",
         Need::Everywhere(Scope::Admin),
     ),
     ("GET HEAD", "/v2/", Need::AnyToken),

@@ -1,6 +1,7 @@
 //! What all handlers share.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use ign_queue::Store;
 use ign_registry::Registry;
@@ -11,6 +12,7 @@ use crate::fetch::Contents;
 use crate::limits::Limits;
 use crate::metrics::Metrics;
 use crate::publish::Mirror;
+use crate::room::Room;
 
 /// The coordinator's parts; one for all connections.
 pub(crate) struct App {
@@ -22,6 +24,11 @@ pub(crate) struct App {
     pub(crate) metrics: Metrics,
     pub(crate) mirror: Mirror,
     pub(crate) redirect_blobs: bool,
+    pub(crate) room: Room,
+    /// Where damaged content is repaired from.
+    pub(crate) replica: Option<Registry>,
+    /// How often every digest is read again.
+    pub(crate) audit_every: Option<Duration>,
     /// Cancelled when the coordinator is to end: long polls and streams end then.
     pub(crate) stopping: CancellationToken,
 }

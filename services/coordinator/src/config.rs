@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use ign_queue::{Settings, StoreError};
 use ign_registry::{RegistryError, StoreConfig};
@@ -33,6 +34,30 @@ pub struct Config {
     pub behind_tls_proxy: bool,
     /// What a peer may cost.
     pub limits: Limits,
+    /// What keeps the store sound.
+    pub care: Care,
+}
+
+/// What keeps the store sound over the years.
+#[derive(Clone, Debug)]
+pub struct Care {
+    /// New work is refused while the disk of a local store or database has fewer free bytes than this; results of what
+    /// runs may use half of it.
+    pub reserve_bytes: u64,
+    /// Every digest is read again once in this time; none: only on request.
+    pub audit_every: Option<Duration>,
+    /// Another registry with the same content, from which damage is repaired. It is only read.
+    pub replica: Option<StoreConfig>,
+}
+
+impl Default for Care {
+    fn default() -> Self {
+        Self {
+            reserve_bytes: 512 * 1024 * 1024,
+            audit_every: Some(Duration::from_hours(30 * 24)),
+            replica: None,
+        }
+    }
 }
 
 /// Why a coordinator did not start or had to end.
@@ -84,6 +109,12 @@ pub enum ServeError {
         /// What it said.
         #[source]
         source: RegistryError,
+    },
+    /// The bucket records versions that the database does not know, and they cannot be taken over.
+    #[error("cannot rebuild the registry: {reason}")]
+    Rebuild {
+        /// What went wrong; the log has the story.
+        reason: String,
     },
     /// The endpoint file cannot be written.
     #[error("cannot write {}", path.display())]

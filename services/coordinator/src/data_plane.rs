@@ -40,6 +40,7 @@ use crate::error::internal;
 use crate::fetch::Item;
 use crate::http_answer::{Refused, oci_error};
 use crate::limits::{MAX_BLOB_BYTES, SIGNED_FOR};
+use crate::room::Write;
 use crate::trace;
 
 const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
@@ -269,6 +270,7 @@ async fn begin_upload(
     request: Request,
 ) -> Answer {
     let object = object.name()?;
+    check_room(&app, &request)?;
     if let Some(digest) = query.digest {
         let digest: Digest = digest.parse()?;
         let body = pieces(&app, request);
@@ -308,6 +310,7 @@ async fn add_to_upload(
     request: Request,
 ) -> Answer {
     let (object, id) = (object.name()?, upload.id()?);
+    check_room(&app, &request)?;
     let first = content_range_start(request.headers())?;
     match append(&app, &object, id, first, request).await? {
         Ok(end) => Ok(upload_answer(StatusCode::ACCEPTED, &object, id, end)),
@@ -323,6 +326,7 @@ async fn finish_upload(
     request: Request,
 ) -> Answer {
     let (object, id) = (object.name()?, upload.id()?);
+    check_room(&app, &request)?;
     let digest: Digest = query
         .digest
         .ok_or_else(|| Cause::bad_field("digest", "the query must name it"))?
@@ -386,6 +390,15 @@ async fn append(
         }
     });
     Ok(appended.await.map_err(|error| internal(&error))?)
+}
+
+/// Fails before any byte is read when the body would not fit.
+fn check_room(app: &App, request: &Request) -> Result<(), Refused> {
+    let length = request.headers().get(CONTENT_LENGTH);
+    let bytes = length
+        .and_then(|length| length.to_str().ok()?.parse().ok())
+        .unwrap_or(0);
+    app.room.check(Write::Blob { bytes })
 }
 
 /// The body in pieces, counted.
@@ -516,6 +529,7 @@ async fn put_manifest(
     request: Request,
 ) -> Answer {
     let object = object.name()?;
+    app.room.check(Write::Work)?;
     let Ok(claimed) = reference.parse::<Digest>() else {
         let message =
             "only the coordinator gives names to manifests; put captures by digest".to_owned();

@@ -72,6 +72,20 @@ impl From<RegistryError> for Refused {
             RegistryError::Store { .. } => {
                 unavailable("the object store cannot be reached", &error)
             }
+            RegistryError::Full { .. } => {
+                tracing::warn!(
+                    request.id = request_id(),
+                    error = chain(&error),
+                    "the object store is full"
+                );
+                Cause::Full {
+                    message: "the object store is full: make room, or collect garbage".to_owned(),
+                }
+            }
+            RegistryError::VersionUnknown { .. } => Cause::NotAllowed {
+                reason: "VERSION_UNKNOWN".to_owned(),
+                message: error.to_string(),
+            },
             RegistryError::Location { .. }
             | RegistryError::VersionTaken { .. }
             | RegistryError::Damaged { .. } => internal(&error),

@@ -48,6 +48,7 @@ impl IntoResponse for Refused {
             | Cause::Conflict => (StatusCode::CONFLICT, "CONFLICT"),
             Cause::Unavailable { .. } => (StatusCode::SERVICE_UNAVAILABLE, "UNAVAILABLE"),
             Cause::TooMany { .. } => (StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS"),
+            Cause::Full { .. } => (StatusCode::INSUFFICIENT_STORAGE, "FULL"),
             Cause::Unauthenticated => (StatusCode::UNAUTHORIZED, "UNAUTHORIZED"),
             Cause::Forbidden { .. } => (StatusCode::FORBIDDEN, "DENIED"),
             Cause::Internal { .. } | Cause::Transport { .. } => {

@@ -9,9 +9,10 @@ use std::time::Duration;
 use futures::Stream;
 use futures::stream::{self, StreamExt as _, TryStreamExt as _};
 use ign_proto::v1::jobs_server::Jobs;
-use ign_proto::{Cause, CollectionId, Digest, JobId, Kind, Manifest, Scope, v1};
+use ign_proto::{Cause, CollectionId, Digest, JobId, Kind, Scope, v1};
 use ign_queue::store::MAX_PAGE;
 use ign_queue::{Job, JobFilter, JobPage, JobState, Status as Screen, StoreError, Submit, Worker};
+use ign_registry::RegistryError;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
@@ -24,6 +25,7 @@ use crate::convert::{
     to_worker,
 };
 use crate::http_answer::Refused;
+use crate::room::Write;
 use crate::trace;
 
 const DEFAULT_PAGE: u32 = 100;
@@ -48,7 +50,10 @@ impl App {
         if job.state == JobState::Queued {
             let waiting = self.store.waiting(job).await?;
             wire.queue_position = waiting.position;
-            wire.waiting_for = waiting.reason;
+            wire.waiting_for = match self.room.check(Write::Work) {
+                Ok(()) => waiting.reason,
+                Err(Refused(full)) => full.to_string(),
+            };
         }
         if let Some(version) = job.version {
             match self
@@ -155,10 +160,17 @@ impl App {
                 message,
             })
         };
-        let Some(bytes) = self.registry.manifest(digest).await? else {
-            return Err(missing(format!("capture {digest} was not uploaded")));
+        let manifest = match self.registry.manifest_to_name(digest).await {
+            Ok(Some(manifest)) => manifest,
+            Ok(None) => {
+                return Err(missing(format!("capture {digest} was not uploaded")));
+            }
+            Err(error @ RegistryError::BlobsMissing { .. }) => {
+                return Err(missing(format!("of capture {digest}: {error}")));
+            }
+            Err(error) => return Err(error.into()),
         };
-        match Manifest::decode(&bytes)?.kind() {
+        match manifest.kind() {
             Kind::Capture => Ok(()),
             Kind::Bundle => Err(missing(format!("{digest} is a bundle, not a capture"))),
         }
@@ -170,6 +182,7 @@ impl App {
         caller: &Caller,
         requests: Vec<v1::SubmitRequest>,
     ) -> Result<Vec<Result<Job, Refused>>, Refused> {
+        self.room.check(Write::Work)?;
         let parsed: Vec<Result<Submit, Refused>> = requests
             .into_iter()
             .map(|request| {
@@ -209,7 +222,9 @@ impl App {
             })
             .collect();
         let good: Vec<Submit> = checked.iter().flatten().cloned().collect();
+        ign_faults::point("submit.checked");
         let mut jobs = self.store.submit_batch(good).await?.into_iter();
+        ign_faults::point("submit.committed");
         Ok(checked
             .into_iter()
             .map(|submit| {
@@ -326,7 +341,10 @@ impl Jobs for JobsApi {
     async fn retry(&self, request: Request<v1::GetJobRequest>) -> Answer<v1::Job> {
         let caller = caller(request.extensions())?;
         let id = &request.get_ref().job_id;
-        let id = self.0.find_job(&caller, Scope::Submit, id).await?.id;
+        let job = self.0.find_job(&caller, Scope::Submit, id).await?;
+        // It may have ended so long ago that its capture was collected.
+        self.0.check_capture(&job.spec.capture_digest).await?;
+        let id = job.id;
         let job = self.0.store.retry(id).await.map_err(Refused::from)?;
         tracing::info!(job.id = %id, "retry requested");
         Ok(Response::new(self.0.full_job(&job).await?))

@@ -2,10 +2,10 @@
 //!
 //! ```text
 //!             one port, HTTP/2 and HTTP/1.1, TLS or not
-//!   trace -> cors -> auth -+-> ign.v1 (jobs, workers, bundles, tokens, ...) -> ign-queue (database)
+//!   trace -> cors -> auth -+-> ign.v1 (jobs, workers, bundles, admin, ...)  -> ign-queue (database)
 //!                          +-> /v2/... blobs and manifests (data_plane)     -> ign-registry (bucket)
 //!                          +-> /healthz /readyz /metrics, gRPC health and reflection
-//!   tasks: reap lost leases · mirror what is published into the bucket · drop stale uploads
+//!   tasks: reap lost leases · mirror what is published into the bucket · drop stale uploads · audit
 //! ```
 //!
 //! **Architecture invariants.** The coordinator decides nothing by itself: every rule about jobs is the queue's, under a
@@ -15,10 +15,12 @@
 //! [`access`] alone; what is not there does not exist.
 
 mod access;
+mod admin;
 mod app;
 mod auth;
 mod body;
 mod bundles;
+mod care;
 mod collections;
 mod config;
 mod connections;
@@ -33,6 +35,7 @@ mod maintenance;
 mod metrics;
 mod operations;
 mod publish;
+mod room;
 mod server;
 mod throttle;
 mod tls;
@@ -41,7 +44,7 @@ mod tokens;
 mod trace;
 mod workers;
 
-pub use config::{Config, ServeError};
+pub use config::{Care, Config, ServeError};
 pub use limits::{Limits, Rate};
 pub use server::{Running, serve};
 pub use tls::TlsFiles;

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Parser, ValueEnum};
-use ign_coordinator::{Config, Limits, TlsFiles, serve};
+use ign_coordinator::{Care, Config, Limits, TlsFiles, serve};
 use ign_queue::Settings;
 use ign_registry::StoreConfig;
 use tokio::signal::unix::{SignalKind, signal};
@@ -56,6 +56,15 @@ struct Args {
     /// the store under the address that the coordinator uses.
     #[arg(long, env = "IGN_REDIRECT_BLOBS", default_value_t = true, action = clap::ArgAction::Set)]
     redirect_blobs: bool,
+    /// Refuse new work while the disk of a local store or database has less free space than this; 0 never refuses.
+    #[arg(long, env = "IGN_RESERVE_MIB", default_value_t = 512)]
+    reserve_mib: u64,
+    /// Read every digest of the store again once in this many days; 0 only on request (ignctl admin audit).
+    #[arg(long, env = "IGN_AUDIT_DAYS", default_value_t = 30)]
+    audit_days: u32,
+    /// Store with the same content from which damaged files are repaired; it is only read.
+    #[arg(long, env = "IGN_REPLICA")]
+    replica: Option<String>,
     /// Form of the log on stderr; IGN_LOG sets the level (info, debug, ign_coordinator=debug, ...).
     #[arg(long, env = "IGN_LOG_FORMAT", value_enum, default_value = "text")]
     log_format: LogFormat,
@@ -121,6 +130,11 @@ async fn run(args: Args) -> anyhow::Result<()> {
         }),
         behind_tls_proxy: args.behind_tls_proxy,
         limits: Limits::default(),
+        care: Care {
+            reserve_bytes: args.reserve_mib.saturating_mul(1024 * 1024),
+            audit_every: (args.audit_days > 0).then(|| Duration::from_hours(24) * args.audit_days),
+            replica: args.replica.map(StoreConfig::new),
+        },
     };
     let shutdown = async move {
         tokio::select! {

@@ -1,5 +1,5 @@
 //! What must happen without anybody asking: taking jobs back from silent workers, repairing the bucket's record of
-//! versions, dropping uploads that nobody goes on with.
+//! versions, dropping uploads that nobody goes on with, reading every digest again.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -10,13 +10,14 @@ use crate::app::App;
 use crate::http_answer::Refused;
 
 const UPLOAD_SWEEP: Duration = Duration::from_hours(1);
+const AUDIT_TICK: Duration = Duration::from_mins(1);
 const UPLOAD_IDLE: Duration = Duration::from_hours(7 * 24);
 
 /// Runs until the coordinator stops.
 pub(crate) async fn run(app: &App) {
     tokio::select! {
         () = app.stopping.cancelled() => {}
-        ((), ()) = async { tokio::join!(reap(app), repair(app)) } => {}
+        ((), (), ()) = async { tokio::join!(reap(app), repair(app), audit(app)) } => {}
     }
 }
 
@@ -63,6 +64,20 @@ async fn repair(app: &App) {
                 Ok(dropped) => tracing::info!(dropped, "dropped uploads that nobody went on with"),
                 Err(error) => drop(Refused::from(error)),
             }
+        }
+    }
+}
+
+async fn audit(app: &App) {
+    let Some(every) = app.audit_every else {
+        return;
+    };
+    let mut tick = tokio::time::interval(AUDIT_TICK.min(every / 256));
+    tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        tick.tick().await;
+        if let Err(Refused(cause)) = app.audit_when_due(every).await {
+            tracing::warn!(error = %cause, "an audit broke off; the next slice goes on");
         }
     }
 }

@@ -14,6 +14,7 @@ pub(crate) struct Metrics {
     pub(crate) bytes_sent: AtomicU64,
     pub(crate) published: AtomicU64,
     pub(crate) reaped: AtomicU64,
+    pub(crate) registry_faults: AtomicU64,
 }
 
 #[derive(Debug, Default)]
@@ -106,6 +107,12 @@ impl Metrics {
             "counter",
             "jobs taken back from silent workers",
             &plain(load(&self.reaped)),
+        );
+        metric(
+            "ign_registry_faults_total",
+            "counter",
+            "damaged or absent content that audits found",
+            &plain(load(&self.registry_faults)),
         );
         if let Some(bytes) = resident_bytes() {
             metric(

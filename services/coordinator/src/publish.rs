@@ -59,6 +59,7 @@ impl App {
             .store
             .publish_and_complete(job, attempt, bundle)
             .await?;
+        ign_faults::point("publish.committed");
         self.mirror(&version.object, Some(version.version)).await;
         Ok(version)
     }
@@ -152,5 +153,13 @@ fn state(versions: &[Version]) -> ObjectState {
         .filter(|version| version.retired)
         .map(|version| version.version)
         .collect();
-    ObjectState { aliases, retired }
+    let retired_at = versions
+        .iter()
+        .filter_map(|version| Some((version.version, version.retired_at?)))
+        .collect();
+    ObjectState {
+        aliases,
+        retired,
+        retired_at,
+    }
 }

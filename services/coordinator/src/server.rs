@@ -14,6 +14,7 @@ use axum::http::header::{
     RANGE,
 };
 use axum::http::{HeaderMap, HeaderName, Method};
+use ign_proto::v1::admin_server::AdminServer;
 use ign_proto::v1::bundles_server::BundlesServer;
 use ign_proto::v1::collections_server::CollectionsServer;
 use ign_proto::v1::jobs_server::JobsServer;
@@ -28,6 +29,7 @@ use tokio_util::sync::CancellationToken;
 use tonic_health::server::HealthReporter;
 use tower_http::cors::{Any, CorsLayer};
 
+use crate::admin::AdminApi;
 use crate::app::App;
 use crate::auth::{self, Doorkeeper};
 use crate::body;
@@ -37,12 +39,13 @@ use crate::config::{Config, ServeError};
 use crate::connections::Door;
 use crate::data_plane;
 use crate::fetch::Contents;
-use crate::http_answer::unknown;
+use crate::http_answer::{Refused, unknown};
 use crate::jobs::JobsApi;
 use crate::maintenance;
 use crate::metrics::Metrics;
 use crate::operations;
 use crate::publish::Mirror;
+use crate::room::Room;
 use crate::tls::Tls;
 use crate::tokens::TokensApi;
 use crate::trace;
@@ -102,6 +105,12 @@ pub async fn serve(
     let registry = Registry::open(&config.store)
         .await
         .map_err(|source| ServeError::Registry { source })?;
+    let replica = match &config.care.replica {
+        None => None,
+        Some(replica) => {
+            Some(Registry::connect(replica).map_err(|source| ServeError::Registry { source })?)
+        }
+    };
     let store = ign_queue::open(&config.database, config.settings)
         .await
         .map_err(|source| ServeError::Database { source })?;
@@ -128,8 +137,16 @@ pub async fn serve(
         metrics: Metrics::default(),
         mirror: Mirror::default(),
         redirect_blobs: config.redirect_blobs,
+        room: Room::new(&config),
+        replica,
+        audit_every: config.care.audit_every,
         stopping: CancellationToken::new(),
     });
+    app.rebuild_if_behind()
+        .await
+        .map_err(|Refused(cause)| ServeError::Rebuild {
+            reason: cause.to_string(),
+        })?;
     let (health, router) = router(&app).await;
     if let Some(path) = &config.endpoint_file {
         write_endpoint(path, scheme, address, &config.token_file).map_err(|source| {
@@ -209,6 +226,9 @@ async fn router(app: &Arc<App>) -> (HealthReporter, Router) {
         )
         .add_service(
             TokensServer::new(TokensApi(app.clone())).max_decoding_message_size(MAX_MESSAGE_BYTES),
+        )
+        .add_service(
+            AdminServer::new(AdminApi(app.clone())).max_decoding_message_size(MAX_MESSAGE_BYTES),
         );
     match tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)

@@ -17,6 +17,7 @@ use crate::convert::{
     failure, job_attempt, log_lines, parsed, progress, required, to_bundle, to_spec, worker_info,
 };
 use crate::http_answer::Refused;
+use crate::room::Write;
 use crate::trace;
 
 /// Longest long poll.
@@ -57,15 +58,23 @@ impl Workers for WorkersApi {
         let deadline = Instant::now() + wait;
         let mut changes = self.0.store.work();
         loop {
+            // A job that is begun now could not bring its result home.
+            let full = self.0.room.check(Write::Work).is_err();
             // In a task of its own: a client that leaves in the middle must not cut a claim in two.
             let claim = trace::spawn({
                 let (app, worker, reach) = (self.0.clone(), worker.clone(), reach.clone());
-                async move { app.store.lease_within(&worker, reach.only()).await }
+                async move {
+                    if full {
+                        return Ok(None);
+                    }
+                    app.store.lease_within(&worker, reach.only()).await
+                }
             });
             let job = claim
                 .await
                 .map_err(|error| Refused(crate::error::internal(&error)))?;
             if let Some(job) = job.map_err(Refused::from)? {
+                ign_faults::point("lease.committed");
                 tracing::info!(job.id = %job.id, job.attempt = job.attempt.0, worker.id = %worker.id, "leased");
                 return Ok(Response::new(v1::LeaseResponse {
                     lease: Some(v1::Lease {
@@ -139,11 +148,13 @@ impl Workers for WorkersApi {
             }
             .status());
         }
+        ign_faults::point("checkpoint.checked");
         self.0
             .store
             .checkpoint(job, attempt, checkpoint)
             .await
             .map_err(Refused::from)?;
+        ign_faults::point("checkpoint.committed");
         Ok(Response::new(v1::CheckpointResponse {}))
     }
 

@@ -25,8 +25,9 @@ pub use state::{
     Backoff, Checkpoint, Failure, FailureKind, Job, JobSpec, JobState, Level, Progress,
 };
 pub use store::{
-    Collection, JobFilter, JobPage, LogLine, NewLogLine, NewVersion, Orders, Reaped, Settings,
-    Status, Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker, WorkerInfo,
+    Adopted, Collection, Event, JobFilter, JobPage, LogLine, Named, NewLogLine, NewVersion, Orders,
+    Reaped, Settings, Status, Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker,
+    WorkerInfo,
 };
 pub use token::{NewToken, SecretHash, Token, TokenKey, Tokens};
 

@@ -30,6 +30,10 @@ const NOTIFY_PAUSE: Duration = Duration::from_millis(10);
 const JOB_WORD: &str = "job";
 const WORK_WORD: &str = "work";
 const MAX_CONNECTIONS: u32 = 24;
+/// A row that somebody else holds for longer is an outage, not a reason to wait for ever.
+const LOCK_TIMEOUT: &str = "10s";
+/// A coordinator that froze in the middle of a transaction lets go of its rows after this time.
+const IDLE_TRANSACTION_TIMEOUT: &str = "20s";
 
 static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("../../migrations/postgres");
 
@@ -99,7 +103,14 @@ pub(crate) async fn open(url: &str, settings: Settings) -> Result<PostgresStore>
             message: "the database URL is not valid".to_owned(),
             source: Some(source),
         })?
-        .application_name("ign");
+        .application_name("ign")
+        .options([
+            ("lock_timeout", LOCK_TIMEOUT),
+            (
+                "idle_in_transaction_session_timeout",
+                IDLE_TRANSACTION_TIMEOUT,
+            ),
+        ]);
     let pool = PgPoolOptions::new()
         .max_connections(MAX_CONNECTIONS)
         .acquire_timeout(Duration::from_secs(10))

@@ -26,9 +26,9 @@ use crate::check;
 use crate::error::from_commit;
 use crate::state::{Checkpoint, Failure, Job, JobSpec, JobState, Level, Progress, Refusal};
 use crate::store::{
-    Collection, JobFilter, JobPage, LogLine, MAX_LOG_LINES, MAX_PAGE, NewLogLine, NewVersion,
-    Orders, Reaped, Result, Settings, Status, Store, StoreError, Submit, Version, VersionFilter,
-    Waiting, Worker, WorkerInfo,
+    Adopted, Collection, Event, JobFilter, JobPage, LogLine, MAX_EVENTS, MAX_LOG_LINE_BYTES,
+    MAX_LOG_LINES, MAX_PAGE, Named, NewLogLine, NewVersion, Orders, Reaped, Result, Settings,
+    Status, Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker, WorkerInfo,
 };
 use crate::token::{NewToken, SecretHash, Token, TokenKey, Tokens};
 use crate::waiting::{Rival, Surroundings, describe};
@@ -37,6 +37,8 @@ type DbRow = <Db as sqlx::Database>::Row;
 
 /// Rows of one insert; a row has at most a dozen bound values, and `SQLite` takes 32,766 of them.
 const CHUNK: usize = 500;
+/// The alias that every publish moves.
+const LATEST: &str = "latest";
 /// A worker's row is written again after this many seconds, so that idle workers cost reads only.
 const WORKER_FRESH_SECS: i64 = 5;
 const WORKER_LISTED_SECS: i64 = 3600;
@@ -175,6 +177,7 @@ fn version_from(row: &DbRow) -> Result<Version> {
         created_at: time(row, "created_at")?,
         job: from_key(row.try_get("job_id")?)?,
         retired: row.try_get("retired")?,
+        retired_at: optional_time(row, "retired_at")?,
     })
 }
 
@@ -397,6 +400,68 @@ async fn point_alias(
     .bind(i64::from(version))
     .execute(connection)
     .await?;
+    Ok(())
+}
+
+async fn insert_version(connection: &mut Connection, version: &Version) -> Result<()> {
+    sqlx::query(
+        "insert into versions (collection, object, version, manifest_digest, size_bytes, file_count, metrics_json, \
+         job_id, created_at, retired, retired_at) values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11)",
+    )
+    .bind(version.object.collection.as_str())
+    .bind(version.object.object.as_str())
+    .bind(i64::from(version.version))
+    .bind(version.bundle.manifest_digest.as_str())
+    .bind(version.bundle.size_bytes as i64)
+    .bind(i64::from(version.bundle.file_count))
+    .bind(&version.bundle.metrics_json)
+    .bind(key(version.job))
+    .bind(to_db(version.created_at))
+    .bind(version.retired)
+    .bind(version.retired_at.map(to_db))
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+/// Takes a version out of listings, or puts it back.
+async fn set_retired(
+    connection: &mut Connection,
+    object: &ObjectName,
+    version: u32,
+    at: Option<DateTime<Utc>>,
+) -> Result<()> {
+    sqlx::query(
+        "update versions set retired = $4, retired_at = $5 where collection = $1 and object = $2 and version = $3",
+    )
+    .bind(object.collection.as_str())
+    .bind(object.object.as_str())
+    .bind(i64::from(version))
+    .bind(at.is_some())
+    .bind(at.map(to_db))
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+/// Points `latest` to the newest version that is listed.
+async fn point_latest(connection: &mut Connection, object: &ObjectName) -> Result<()> {
+    let newest: Option<i64> = sqlx::query_scalar(
+        "select max(version) from versions where collection = $1 and object = $2 and not retired",
+    )
+    .bind(object.collection.as_str())
+    .bind(object.object.as_str())
+    .fetch_one(&mut *connection)
+    .await?;
+    if let Some(newest) = newest {
+        return point_alias(connection, object, LATEST, small(newest)?).await;
+    }
+    sqlx::query("delete from aliases where collection = $1 and object = $2 and alias = $3")
+        .bind(object.collection.as_str())
+        .bind(object.object.as_str())
+        .bind(LATEST)
+        .execute(connection)
+        .await?;
     Ok(())
 }
 
@@ -1127,22 +1192,18 @@ impl Store for SqlStore {
         .fetch_one(&mut *transaction)
         .await?;
         let version = small(version)?;
-        sqlx::query(
-            "insert into versions (collection, object, version, manifest_digest, size_bytes, file_count, \
-             metrics_json, job_id, created_at) values ($1, $2, $3, $4, $5, $6, $7, $8, $9)",
-        )
-        .bind(object.collection.as_str())
-        .bind(object.object.as_str())
-        .bind(i64::from(version))
-        .bind(bundle.manifest_digest.as_str())
-        .bind(bundle.size_bytes as i64)
-        .bind(i64::from(bundle.file_count))
-        .bind(&bundle.metrics_json)
-        .bind(key(job.id))
-        .bind(to_db(now))
-        .execute(&mut *transaction)
-        .await?;
-        point_alias(&mut transaction, &object, "latest", version).await?;
+        let new = Version {
+            object: object.clone(),
+            version,
+            bundle,
+            aliases: Vec::new(),
+            created_at: now,
+            job: job.id,
+            retired: false,
+            retired_at: None,
+        };
+        insert_version(&mut transaction, &new).await?;
+        point_alias(&mut transaction, &object, LATEST, version).await?;
         job.complete(attempt, version, now)
             .map_err(|refusal| refused(&job, attempt, refusal))?;
         save_job(&mut transaction, &job).await?;
@@ -1273,52 +1334,213 @@ impl Store for SqlStore {
     }
 
     async fn retire(&self, object: &ObjectName, reference: &str) -> Result<Version> {
-        let (mut transaction, _now) = self.begin().await?;
+        let (mut transaction, now) = self.begin().await?;
         let outcome = async {
-        lock_object(&mut transaction, object).await?;
-        let version = find_version(&mut transaction, object, reference).await?;
-        if let Some(alias) = version.aliases.iter().find(|alias| *alias != "latest") {
-            return Err(StoreError::NotAllowed {
-                message: format!(
-                    "alias {alias} points to {object}:v{}; move it first",
-                    version.version
-                ),
-            });
-        }
-        sqlx::query("update versions set retired = $4 where collection = $1 and object = $2 and version = $3")
-            .bind(object.collection.as_str())
-            .bind(object.object.as_str())
-            .bind(i64::from(version.version))
-            .bind(true)
-            .execute(&mut *transaction)
-            .await?;
-        if !version.aliases.is_empty() {
-            let newest: Option<i64> = sqlx::query_scalar(
-                "select max(version) from versions where collection = $1 and object = $2 and not retired",
-            )
-            .bind(object.collection.as_str())
-            .bind(object.object.as_str())
-            .fetch_one(&mut *transaction)
-            .await?;
-            match newest {
-                Some(newest) => {
-                    point_alias(&mut transaction, object, "latest", small(newest)?).await?;
-                }
-                None => {
-                    sqlx::query("delete from aliases where collection = $1 and object = $2 and alias = 'latest'")
-                        .bind(object.collection.as_str())
-                        .bind(object.object.as_str())
-                        .execute(&mut *transaction)
-                        .await?;
-                }
+            lock_object(&mut transaction, object).await?;
+            let version = find_version(&mut transaction, object, reference).await?;
+            if let Some(alias) = version.aliases.iter().find(|alias| *alias != LATEST) {
+                return Err(StoreError::NotAllowed {
+                    message: format!(
+                        "alias {alias} points to {object}:v{}; move it first",
+                        version.version
+                    ),
+                });
             }
-        }
-        let version =
-            find_version(&mut transaction, object, &format!("v{}", version.version)).await?;
-        Ok(version)
+            if version.retired {
+                return Ok(version);
+            }
+            set_retired(&mut transaction, object, version.version, Some(now)).await?;
+            if !version.aliases.is_empty() {
+                point_latest(&mut transaction, object).await?;
+            }
+            find_version(&mut transaction, object, &format!("v{}", version.version)).await
         }
         .await;
         self.finish(transaction, outcome, Change::Job).await
+    }
+
+    async fn restore(&self, object: &ObjectName, reference: &str) -> Result<Version> {
+        let (mut transaction, _now) = self.begin().await?;
+        let outcome = async {
+            lock_object(&mut transaction, object).await?;
+            let version = find_version(&mut transaction, object, reference).await?;
+            if version.retired {
+                set_retired(&mut transaction, object, version.version, None).await?;
+                point_latest(&mut transaction, object).await?;
+            }
+            find_version(&mut transaction, object, &format!("v{}", version.version)).await
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Job).await
+    }
+
+    async fn adopt(&self, object: &ObjectName, versions: &[Version]) -> Result<Adopted> {
+        for version in versions {
+            check::bundle(&version.bundle)?;
+            for alias in &version.aliases {
+                check::alias(alias)?;
+            }
+        }
+        let (mut transaction, _now) = self.begin().await?;
+        let outcome = async {
+            let last = versions.iter().map(|it| it.version).max().unwrap_or(0);
+            sqlx::query(
+                "insert into objects (collection, object, last_version) values ($1, $2, $3) \
+                 on conflict (collection, object) do update set last_version = case \
+                 when excluded.last_version > objects.last_version then excluded.last_version \
+                 else objects.last_version end",
+            )
+            .bind(object.collection.as_str())
+            .bind(object.object.as_str())
+            .bind(i64::from(last))
+            .execute(&mut *transaction)
+            .await?;
+            let mut adopted = Adopted::default();
+            for version in versions {
+                let reference = format!("v{}", version.version);
+                let added = match find_version(&mut transaction, object, &reference).await {
+                    Ok(known) if known.bundle == version.bundle && known.job == version.job => {
+                        adopted.known += 1;
+                        false
+                    }
+                    Ok(_) => {
+                        adopted.differing.push(version.version);
+                        continue;
+                    }
+                    Err(StoreError::NotFound { .. }) => {
+                        insert_version(&mut transaction, version).await?;
+                        adopted.added.push(version.version);
+                        true
+                    }
+                    Err(error) => return Err(error),
+                };
+                for alias in &version.aliases {
+                    let unknown = matches!(
+                        find_version(&mut transaction, object, alias).await,
+                        Err(StoreError::NotFound { .. })
+                    );
+                    if added || unknown {
+                        point_alias(&mut transaction, object, alias, version.version).await?;
+                    }
+                }
+            }
+            Ok(adopted)
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Job).await
+    }
+
+    async fn named(&self, grace: Duration) -> Result<Named> {
+        let (mut transaction, now) = self.begin().await?;
+        let outcome = async {
+            // A coordinator of the version before this column retires without a time: the grace begins now.
+            sqlx::query("update versions set retired_at = $1 where retired and retired_at is null")
+                .bind(to_db(now))
+                .execute(&mut *transaction)
+                .await?;
+            let since = to_db(now - chrono::TimeDelta::from_std(grace).map_err(internal)?);
+            let mut named = Named::default();
+            let rows = sqlx::query(
+                "select distinct manifest_digest from versions where not retired or retired_at > $1",
+            )
+            .bind(since)
+            .fetch_all(&mut *transaction)
+            .await?;
+            for row in rows {
+                named.manifests.insert(parse(row.try_get("manifest_digest")?)?);
+            }
+            let rows = sqlx::query(
+                "select distinct capture_digest, checkpoint_digest from jobs \
+                 where finished_at is null or finished_at > $1",
+            )
+            .bind(since)
+            .fetch_all(&mut *transaction)
+            .await?;
+            for row in rows {
+                named.manifests.insert(parse(row.try_get("capture_digest")?)?);
+                if let Some(digest) = row.try_get::<Option<&str>, _>("checkpoint_digest")? {
+                    named.checkpoints.insert(parse(digest)?);
+                }
+            }
+            Ok(named)
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Nothing).await
+    }
+
+    async fn record(&self, kind: &str, subject: &str, message: &str) -> Result<()> {
+        let (mut transaction, now) = self.begin().await?;
+        let outcome = async {
+            let seq: i64 = sqlx::query_scalar(
+                "insert into events (at, kind, subject, message) values ($1, $2, $3, $4) returning seq",
+            )
+            .bind(to_db(now))
+            .bind(kind)
+            .bind(check::clean(subject, MAX_LOG_LINE_BYTES))
+            .bind(check::clean(message, MAX_LOG_LINE_BYTES))
+            .fetch_one(&mut *transaction)
+            .await?;
+            sqlx::query("delete from events where seq <= $1")
+                .bind(seq - MAX_EVENTS as i64)
+                .execute(&mut *transaction)
+                .await?;
+            Ok(())
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Nothing).await
+    }
+
+    async fn events(&self, before_seq: u64, limit: u32) -> Result<Vec<Event>> {
+        let before = match before_seq {
+            0 => i64::MAX,
+            seq => i64::try_from(seq).unwrap_or(i64::MAX),
+        };
+        let rows = sqlx::query("select * from events where seq < $1 order by seq desc limit $2")
+            .bind(before)
+            .bind(i64::from(limit.clamp(1, MAX_PAGE)))
+            .fetch_all(self.backend.reader())
+            .await?;
+        rows.iter()
+            .map(|row| {
+                Ok(Event {
+                    seq: count(row.try_get("seq")?),
+                    at: time(row, "at")?,
+                    kind: row.try_get("kind")?,
+                    subject: row.try_get("subject")?,
+                    message: row.try_get("message")?,
+                })
+            })
+            .collect()
+    }
+
+    async fn take_turn(&self, work: &str, every: Duration) -> Result<Option<u64>> {
+        let (mut transaction, now) = self.begin().await?;
+        let outcome = async {
+            sqlx::query(
+                "insert into turns (name, last_at, count) values ($1, $2, 0) on conflict do nothing",
+            )
+            .bind(work)
+            .bind(to_db(DateTime::UNIX_EPOCH))
+            .execute(&mut *transaction)
+            .await?;
+            let row = sqlx::query(sql(format!("select * from turns where name = $1 {LOCK}")))
+                .bind(work)
+                .fetch_one(&mut *transaction)
+                .await?;
+            let since = (now - time(&row, "last_at")?).to_std().unwrap_or_default();
+            if since < every {
+                return Ok(None);
+            }
+            let turn: i64 = row.try_get("count")?;
+            sqlx::query("update turns set last_at = $2, count = count + 1 where name = $1")
+                .bind(work)
+                .bind(to_db(now))
+                .execute(&mut *transaction)
+                .await?;
+            Ok(Some(count(turn)))
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Nothing).await
     }
 
     async fn collections(&self) -> Result<Vec<Collection>> {

@@ -22,6 +22,8 @@ pub const MAX_LOG_LINES: u64 = 10_000;
 pub const MAX_LOG_LINE_BYTES: usize = 4096;
 /// Jobs in one page of a list.
 pub const MAX_PAGE: u32 = 1000;
+/// Events kept; older ones go.
+pub const MAX_EVENTS: u64 = 100_000;
 /// Bytes of a recipe.
 pub const MAX_RECIPE_BYTES: usize = 64 * 1024;
 
@@ -241,6 +243,44 @@ pub struct Version {
     pub job: JobId,
     /// Taken out of listings.
     pub retired: bool,
+    /// Since when; its files stay for a grace period after that.
+    pub retired_at: Option<DateTime<Utc>>,
+}
+
+/// What [`Store::adopt`] did.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Adopted {
+    /// Versions that the database did not know.
+    pub added: Vec<u32>,
+    /// Versions that it knew, and the same.
+    pub known: u32,
+    /// Versions that it knows with other content; nothing was changed about them.
+    pub differing: Vec<u32>,
+}
+
+/// What the database names in the object store: nothing of it may go.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Named {
+    /// Manifests of versions that are published or were retired lately, and of captures of jobs that live or ended
+    /// lately.
+    pub manifests: BTreeSet<Digest>,
+    /// Checkpoints of those jobs.
+    pub checkpoints: BTreeSet<Digest>,
+}
+
+/// Something that happened to the registry.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Event {
+    /// Grows with each event.
+    pub seq: u64,
+    /// When, by the database's clock.
+    pub at: DateTime<Utc>,
+    /// A constant word, such as `damage`.
+    pub kind: String,
+    /// What it is about: a path, an object's version; may be empty.
+    pub subject: String,
+    /// In words.
+    pub message: String,
 }
 
 /// Which bundles to list; empty fields do not filter.
@@ -425,6 +465,27 @@ pub trait Store: Tokens + Send + Sync + std::fmt::Debug + 'static {
     /// Takes a version out of listings. `latest` falls back to the newest that is left; another alias that points to it
     /// must be moved first.
     async fn retire(&self, object: &ObjectName, reference: &str) -> Result<Version>;
+
+    /// Puts a retired version back into listings; `latest` points to the newest again. Whether its files are still there
+    /// is the caller's to check.
+    async fn restore(&self, object: &ObjectName, reference: &str) -> Result<Version>;
+
+    /// Takes over versions of one object that the object store records. Those that are known stay as they are; an alias
+    /// follows the given one where it points to a version that was added, or was not there.
+    async fn adopt(&self, object: &ObjectName, versions: &[Version]) -> Result<Adopted>;
+
+    /// What the database names, with what it stopped naming within `grace`.
+    async fn named(&self, grace: Duration) -> Result<Named>;
+
+    /// Remembers that something happened; the last [`MAX_EVENTS`] are kept.
+    async fn record(&self, kind: &str, subject: &str, message: &str) -> Result<()>;
+
+    /// Events with a smaller sequence number (0: all), newest first.
+    async fn events(&self, before_seq: u64, limit: u32) -> Result<Vec<Event>>;
+
+    /// Whether it is the caller's turn to do work that is done once in `every`, whoever does it: the number of the turn,
+    /// from 0.
+    async fn take_turn(&self, work: &str, every: Duration) -> Result<Option<u64>>;
 
     /// All collections by name. Submitting makes a collection.
     async fn collections(&self) -> Result<Vec<Collection>>;

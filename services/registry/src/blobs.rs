@@ -16,13 +16,35 @@ use object_store::path::Path;
 use object_store::{GetOptions, GetRange, ObjectStoreExt as _, PutPayload, WriteMultipart};
 use sha2::{Digest as _, Sha256};
 
-use crate::error::{BodyError, RegistryError, store_error};
+use crate::error::{BodyError, RegistryError, cut, store_error};
 use crate::store::Registry;
 
 /// Part of a multipart write, and the largest body that is written in one piece.
 pub(crate) const PART_BYTES: usize = 8 * 1024 * 1024;
 const PARTS_IN_FLIGHT: usize = 4;
 const CHECKS_IN_FLIGHT: usize = 32;
+
+/// A manifest that was written within this time had all its blobs then, and none was collected since: it is shorter than
+/// any grace.
+const CHECKED_LATELY: Duration = Duration::from_mins(20);
+
+/// What lies under the name of its content.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Content {
+    Blob,
+    Manifest,
+}
+
+impl Content {
+    pub(crate) const ALL: [Self; 2] = [Self::Blob, Self::Manifest];
+
+    pub(crate) fn folder(self) -> &'static str {
+        match self {
+            Self::Blob => "blobs",
+            Self::Manifest => "manifests",
+        }
+    }
+}
 
 /// A blob being read.
 pub struct BlobRead {
@@ -35,25 +57,41 @@ pub struct BlobRead {
 }
 
 impl Registry {
-    pub(crate) fn blob_path(&self, digest: &Digest) -> Path {
+    pub(crate) fn content_path(&self, content: Content, digest: &Digest) -> Path {
         self.path(&format!(
-            "blobs/sha256/{}/{}",
+            "{}/sha256/{}/{}",
+            content.folder(),
             &digest.hex()[..2],
             digest.hex()
         ))
+    }
+
+    pub(crate) fn blob_path(&self, digest: &Digest) -> Path {
+        self.content_path(Content::Blob, digest)
     }
 
     fn manifest_path(&self, digest: &Digest) -> Path {
-        self.path(&format!(
-            "manifests/sha256/{}/{}",
-            &digest.hex()[..2],
-            digest.hex()
-        ))
+        self.content_path(Content::Manifest, digest)
     }
 
-    /// Size of a blob; none when absent.
+    /// Size of a blob; none when absent. One that was in the trash is back afterwards.
     pub async fn blob_size(&self, digest: &Digest) -> Result<Option<u64>, RegistryError> {
-        let path = self.blob_path(digest);
+        if let Some(size) = self.size_of(Content::Blob, digest).await? {
+            return Ok(Some(size));
+        }
+        if self.rescue(Content::Blob, digest).await? {
+            return self.size_of(Content::Blob, digest).await;
+        }
+        Ok(None)
+    }
+
+    /// Size of what lies at its place, the trash aside.
+    pub(crate) async fn size_of(
+        &self,
+        content: Content,
+        digest: &Digest,
+    ) -> Result<Option<u64>, RegistryError> {
+        let path = self.content_path(content, digest);
         match self.store.head(&path).await {
             Ok(meta) => Ok(Some(meta.size)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
@@ -72,7 +110,13 @@ impl Registry {
             range: range.map(GetRange::Bounded),
             ..GetOptions::default()
         };
-        let result = match self.store.get_opts(&path, options).await {
+        let mut found = self.store.get_opts(&path, options.clone()).await;
+        if matches!(found, Err(object_store::Error::NotFound { .. }))
+            && self.rescue(Content::Blob, digest).await?
+        {
+            found = self.store.get_opts(&path, options).await;
+        }
+        let result = match found {
             Ok(result) => result,
             Err(object_store::Error::NotFound { .. }) => return Ok(None),
             Err(error) => return Err(store_error("read", &path)(error)),
@@ -181,6 +225,7 @@ impl Registry {
             (None, Ok(())) => self.put(&path, buffer.freeze().into()).await?,
             (None, Err(error)) => return Err(error),
         }
+        ign_faults::point("blob.written");
         Ok(size_bytes)
     }
 
@@ -199,13 +244,18 @@ impl Registry {
         self.check_blobs(manifest).await?;
         let digest = Digest::of(&bytes);
         self.put(&self.manifest_path(&digest), bytes.into()).await?;
+        ign_faults::point("manifest.written");
         Ok(digest)
     }
 
     /// The bytes of a manifest, checked against the digest; none when absent.
     pub async fn manifest(&self, digest: &Digest) -> Result<Option<Bytes>, RegistryError> {
         let path = self.manifest_path(digest);
-        let Some(bytes) = self.read_small(&path).await? else {
+        let mut found = self.read_small(&path).await?;
+        if found.is_none() && self.rescue(Content::Manifest, digest).await? {
+            found = self.read_small(&path).await?;
+        }
+        let Some(bytes) = found else {
             return Ok(None);
         };
         let actual = Digest::of(&bytes);
@@ -216,6 +266,30 @@ impl Registry {
             });
         }
         Ok(Some(bytes))
+    }
+
+    /// The manifest of a capture or bundle that somebody is about to name, with all its blobs there; none when it is
+    /// absent. One that was checked long ago is checked and written again, so that nothing of it is collected before
+    /// its new name is known.
+    pub async fn manifest_to_name(
+        &self,
+        digest: &Digest,
+    ) -> Result<Option<Manifest>, RegistryError> {
+        let Some(bytes) = self.manifest(digest).await? else {
+            return Ok(None);
+        };
+        let manifest = Manifest::decode(&bytes)?;
+        let path = self.manifest_path(digest);
+        let meta = self
+            .store
+            .head(&path)
+            .await
+            .map_err(store_error("look up", &path))?;
+        let age = chrono::Utc::now() - meta.last_modified;
+        if age.to_std().is_ok_and(|age| age > CHECKED_LATELY) {
+            self.put_manifest_bytes(bytes, &manifest).await?;
+        }
+        Ok(Some(manifest))
     }
 
     /// Fails unless every blob of the manifest is there with the size it says.
@@ -271,10 +345,11 @@ impl Registry {
                 reason,
             });
         }
-        result
-            .bytes()
-            .await
-            .map(Some)
-            .map_err(store_error("read", path))
+        let size_bytes = result.meta.size;
+        let bytes = result.bytes().await.map_err(store_error("read", path))?;
+        if bytes.len() as u64 != size_bytes {
+            return Err(cut(path));
+        }
+        Ok(Some(bytes))
     }
 }

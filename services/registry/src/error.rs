@@ -33,6 +33,17 @@ pub enum RegistryError {
         #[source]
         source: object_store::Error,
     },
+    /// The store has no room left. What was there is unharmed.
+    #[error("object store is full: could not {operation} {path}")]
+    Full {
+        /// Verb: write, copy, ...
+        operation: &'static str,
+        /// Which object.
+        path: String,
+        /// What the store said.
+        #[source]
+        source: object_store::Error,
+    },
     /// The bytes are not those that the digest names. Nothing was kept.
     #[error("content has digest {actual}, not {expected}")]
     WrongDigest {
@@ -93,6 +104,12 @@ pub enum RegistryError {
         /// Path of the record.
         path: String,
     },
+    /// The bucket records a version that the database does not know: nothing may be collected by such a database.
+    #[error("the database does not know {path}; rebuild the registry first")]
+    VersionUnknown {
+        /// Path of the record.
+        path: String,
+    },
     /// An object of the registry's own holds what it should not.
     #[error("{path} is damaged: {reason}")]
     Damaged {
@@ -116,7 +133,9 @@ impl RegistryError {
             | Self::Body { .. } => true,
             Self::Location { .. }
             | Self::Store { .. }
+            | Self::Full { .. }
             | Self::VersionTaken { .. }
+            | Self::VersionUnknown { .. }
             | Self::Damaged { .. } => false,
         }
     }
@@ -134,9 +153,59 @@ pub(crate) fn store_error(
     path: &object_store::path::Path,
 ) -> impl FnOnce(object_store::Error) -> RegistryError {
     let path = path.to_string();
-    move |source| RegistryError::Store {
-        operation,
-        path,
-        source,
+    move |source| {
+        if is_full(&source) {
+            RegistryError::Full {
+                operation,
+                path,
+                source,
+            }
+        } else {
+            RegistryError::Store {
+                operation,
+                path,
+                source,
+            }
+        }
     }
+}
+
+/// A body that ended before its length without a word of the connection.
+pub(crate) fn cut(path: &object_store::path::Path) -> RegistryError {
+    RegistryError::Store {
+        operation: "read",
+        path: path.to_string(),
+        source: object_store::Error::Generic {
+            store: "registry",
+            source: "the body ended early".into(),
+        },
+    }
+}
+
+/// Whether the store says that it has no room. Folders say so by the error's kind; of a bucket's answer only the text is
+/// passed on: status 507, or the error code of the server.
+fn is_full(error: &object_store::Error) -> bool {
+    const WORDS: [&str; 4] = [
+        "507 Insufficient Storage",
+        "QuotaExceeded",
+        "StorageFull",
+        "InsufficientStorage",
+    ];
+    let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(error);
+    while let Some(error) = cause {
+        if let Some(io) = error.downcast_ref::<std::io::Error>()
+            && matches!(
+                io.kind(),
+                std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded
+            )
+        {
+            return true;
+        }
+        let text = error.to_string();
+        if WORDS.iter().any(|word| text.contains(word)) {
+            return true;
+        }
+        cause = error.source();
+    }
+    false
 }

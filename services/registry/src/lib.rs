@@ -6,6 +6,8 @@
 //! versions/<collection>/<object>/v3.json  which manifest is version 3, and where it came from; written once
 //! versions/<collection>/<object>/state.json  aliases and retired versions, rewritten on change
 //! uploads/<id>/...                      parts of uploads that have not finished
+//! trash/blobs/<64 hex>/<uuid>           what nothing names any more, on its way out
+//! damaged/...                           what an audit found to be wrong
 //! ```
 //!
 //! Everything needed to serve the published models lies in the bucket: [`Registry::rebuild`] reads it back.
@@ -15,14 +17,19 @@
 //! local state: any number of coordinators may share one bucket, and each may be killed at any point. A store that does
 //! not honour conditional create (found at start, see [`Probe`]) costs nothing but a warning.
 
+mod audit;
 mod blobs;
+mod collect;
 mod error;
 mod store;
+mod trash;
 mod uploads;
 mod versions;
 
+pub use audit::{Audit, Fault, Outcome};
 pub use blobs::BlobRead;
+pub use collect::{Collected, Keep, Tally};
 pub use error::{BodyError, RegistryError};
 pub use store::{Probe, Registry, StoreConfig};
 pub use uploads::UploadId;
-pub use versions::{ObjectState, Rebuild, VersionRecord};
+pub use versions::{ObjectState, Published, Rebuild, VersionRecord};

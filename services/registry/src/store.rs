@@ -56,6 +56,23 @@ pub struct Registry {
 impl Registry {
     /// Opens the store, checks that it can be written and read, and finds out what it can do.
     pub async fn open(config: &StoreConfig) -> Result<Self, RegistryError> {
+        let registry = Self::connect(config)?.prepared().await?;
+        if !registry.probe.conditional_create {
+            tracing::warn!(
+                store.url = config.url,
+                "store ignores conditional create; the database alone guards versions"
+            );
+        }
+        Ok(registry)
+    }
+
+    /// On a store that is open already; its URLs are not signed.
+    pub async fn on(store: Arc<dyn ObjectStore>) -> Result<Self, RegistryError> {
+        Self::new(store, None, Path::default()).prepared().await
+    }
+
+    /// For reading alone: nothing is written, not even to try the store out.
+    pub fn connect(config: &StoreConfig) -> Result<Self, RegistryError> {
         let wrong = |reason: String| RegistryError::Location {
             url: config.url.clone(),
             reason,
@@ -97,7 +114,11 @@ impl Registry {
                     ));
                 }
             };
-        let mut registry = Self {
+        Ok(Self::new(store, signer, prefix))
+    }
+
+    fn new(store: Arc<dyn ObjectStore>, signer: Option<Arc<dyn Signer>>, prefix: Path) -> Self {
+        Self {
             store,
             probe: Probe {
                 conditional_create: false,
@@ -105,16 +126,13 @@ impl Registry {
             },
             signer,
             prefix,
-        };
-        registry.probe.conditional_create = registry.try_out().await?;
-        if !registry.probe.conditional_create {
-            tracing::warn!(
-                store.url = config.url,
-                "store ignores conditional create; the database alone guards versions"
-            );
         }
-        registry.put_bytes(Bytes::from_static(EMPTY_CONFIG)).await?;
-        Ok(registry)
+    }
+
+    async fn prepared(mut self) -> Result<Self, RegistryError> {
+        self.probe.conditional_create = self.try_out().await?;
+        self.put_bytes(Bytes::from_static(EMPTY_CONFIG)).await?;
+        Ok(self)
     }
 
     /// What the store was found to do.

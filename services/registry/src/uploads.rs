@@ -151,6 +151,7 @@ impl Registry {
             .map_err(|error| Box::new(error) as BodyError)
             .boxed();
         let size_bytes = self.put_stream(expected, limit_bytes, body).await?;
+        ign_faults::point("upload.finished");
         self.drop_upload(id).await?;
         Ok(size_bytes)
     }
@@ -248,7 +249,7 @@ impl Registry {
             .map_err(store_error("list", folder))
     }
 
-    async fn delete(&self, path: &Path) -> Result<(), RegistryError> {
+    pub(crate) async fn delete(&self, path: &Path) -> Result<(), RegistryError> {
         match self.store.delete(path).await {
             Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
             Err(error) => Err(store_error("delete", path)(error)),

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use bytes::Bytes;
 use chrono::{DateTime, Utc};
+use futures::{StreamExt as _, TryStreamExt as _};
 use ign_proto::manifest::{Kind, Manifest};
 use ign_proto::{Digest, JobId, ObjectName};
 use object_store::path::Path;
@@ -15,6 +16,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::RegistryError;
 use crate::store::Registry;
+
+const READS_IN_FLIGHT: usize = 8;
 
 /// `versions/<collection>/<object>/vN.json`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -42,13 +45,25 @@ pub struct ObjectState {
     pub aliases: BTreeMap<String, u32>,
     /// Versions taken out of listings.
     pub retired: BTreeSet<u32>,
+    /// Since when, where that is known.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub retired_at: BTreeMap<u32, DateTime<Utc>>,
+}
+
+/// A version as the bucket has it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Published {
+    /// Its record.
+    pub record: VersionRecord,
+    /// Number of its files.
+    pub file_count: u32,
 }
 
 /// What the bucket says is published.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Rebuild {
     /// Sorted by object and version.
-    pub versions: Vec<VersionRecord>,
+    pub versions: Vec<Published>,
     /// Objects that have aliases or retired versions.
     pub states: BTreeMap<ObjectName, ObjectState>,
     /// Records that cannot be used, and why: `(path, reason)`.
@@ -65,12 +80,39 @@ impl Registry {
         let path = self.version_path(&record.object, &format!("v{}.json", record.version));
         let bytes = to_json(&path, record)?;
         match self.read_small(&path).await? {
-            Some(present) if present == bytes => Ok(()),
-            Some(_) => Err(RegistryError::VersionTaken {
-                path: path.to_string(),
-            }),
-            None => self.put(&path, bytes.into()).await,
+            Some(present) if present == bytes => return Ok(()),
+            Some(present) if serde_json::from_slice::<VersionRecord>(&present).is_ok() => {
+                return Err(RegistryError::VersionTaken {
+                    path: path.to_string(),
+                });
+            }
+            // No record at all: it rotted, and the database knows what it said.
+            Some(_) => self.set_aside(&path).await?,
+            None => {}
         }
+        self.put(&path, bytes.into()).await?;
+        ign_faults::point("version.recorded");
+        Ok(())
+    }
+
+    /// The versions that the bucket records, by name alone: `(object and version, path)`.
+    pub async fn recorded(&self) -> Result<BTreeMap<(ObjectName, u32), String>, RegistryError> {
+        let mut found = BTreeMap::new();
+        for meta in self.list(&self.path("versions")).await? {
+            let names = self.names(&meta.location);
+            let [_, collection, object, file] = names.as_slice() else {
+                continue;
+            };
+            let version = file
+                .strip_prefix('v')
+                .and_then(|rest| rest.strip_suffix(".json"))
+                .and_then(|number| number.parse().ok());
+            if let (Ok(object), Some(version)) = (format!("{collection}/{object}").parse(), version)
+            {
+                found.insert((object, version), meta.location.to_string());
+            }
+        }
+        Ok(found)
     }
 
     /// Writes an object's aliases and retired versions, unless they are there already.
@@ -88,89 +130,137 @@ impl Registry {
         {
             return Ok(());
         }
-        self.put(&path, bytes.into()).await
+        self.put(&path, bytes.into()).await?;
+        ign_faults::point("state.recorded");
+        Ok(())
     }
 
-    /// Reads all versions back from the bucket alone, and checks that each one's manifest and blobs are there.
+    /// Reads all versions back from the bucket alone, and checks that each one's manifest is there, and its blobs unless
+    /// it is retired.
     pub async fn rebuild(&self) -> Result<Rebuild, RegistryError> {
         let mut rebuild = Rebuild::default();
-        for meta in self.list(&self.path("versions")).await? {
-            let path = meta.location;
-            let Some(bytes) = self.read_small(&path).await? else {
-                continue;
-            };
-            match self.read_record(&path, &bytes).await? {
-                Ok(Record::Version(record)) => rebuild.versions.push(record),
-                Ok(Record::State(object, state)) => {
+        let (states, versions): (Vec<Path>, Vec<Path>) = self
+            .list(&self.path("versions"))
+            .await?
+            .into_iter()
+            .map(|meta| meta.location)
+            .partition(|path| path.filename() == Some("state.json"));
+        for path in states {
+            match self.read_state(&path).await? {
+                Some(Ok((object, state))) => {
                     rebuild.states.insert(object, state);
                 }
-                Err(reason) => rebuild.faults.push((path.to_string(), reason)),
+                Some(Err(reason)) => rebuild.faults.push((path.to_string(), reason)),
+                None => {}
             }
         }
-        rebuild
-            .versions
-            .sort_by(|a, b| (&a.object, a.version).cmp(&(&b.object, b.version)));
+        let states = &rebuild.states;
+        let read: Vec<_> = futures::stream::iter(versions)
+            .map(|path| async move {
+                let read = self.read_version(&path, states).await?;
+                Ok::<_, RegistryError>((path, read))
+            })
+            .buffer_unordered(READS_IN_FLIGHT)
+            .try_collect()
+            .await?;
+        for (path, read) in read {
+            match read {
+                Some(Ok(published)) => rebuild.versions.push(published),
+                Some(Err(reason)) => rebuild.faults.push((path.to_string(), reason)),
+                None => {}
+            }
+        }
+        rebuild.versions.sort_by(|a, b| {
+            (&a.record.object, a.record.version).cmp(&(&b.record.object, b.record.version))
+        });
         rebuild.faults.sort();
         Ok(rebuild)
     }
 
-    /// The outer error is the store's; the inner one says why the record cannot be used.
-    async fn read_record(
-        &self,
-        path: &Path,
-        bytes: &[u8],
-    ) -> Result<Result<Record, String>, RegistryError> {
+    /// The object whose folder a record lies in.
+    fn object_of(&self, path: &Path) -> Result<(ObjectName, String), String> {
         let names = self.names(path);
         let [_, collection, object, file] = names.as_slice() else {
-            return Ok(Err("it lies at an unknown place".to_owned()));
+            return Err("it lies at an unknown place".to_owned());
         };
-        let Ok(object) = format!("{collection}/{object}").parse::<ObjectName>() else {
-            return Ok(Err("its folder is no object's name".to_owned()));
+        let object = format!("{collection}/{object}")
+            .parse()
+            .map_err(|error| format!("its folder is no object's name: {error}"))?;
+        Ok((object, file.clone()))
+    }
+
+    /// The inner error says why the record cannot be used; none when it is gone.
+    async fn read_state(
+        &self,
+        path: &Path,
+    ) -> Result<Option<Read<(ObjectName, ObjectState)>>, RegistryError> {
+        let Some(bytes) = self.read_small(path).await? else {
+            return Ok(None);
         };
-        if file == "state.json" {
-            return Ok(serde_json::from_slice(bytes)
-                .map(|state| Record::State(object, state))
-                .map_err(|error| error.to_string()));
-        }
-        let record: VersionRecord = match serde_json::from_slice(bytes) {
-            Ok(record) => record,
-            Err(error) => return Ok(Err(error.to_string())),
+        let read = self.object_of(path).and_then(|(object, _)| {
+            let state = serde_json::from_slice(&bytes).map_err(|error| error.to_string())?;
+            Ok((object, state))
+        });
+        Ok(Some(read))
+    }
+
+    /// The inner error says why the record cannot be used; none when it is gone.
+    async fn read_version(
+        &self,
+        path: &Path,
+        states: &BTreeMap<ObjectName, ObjectState>,
+    ) -> Result<Option<Read<Published>>, RegistryError> {
+        let Some(bytes) = self.read_small(path).await? else {
+            return Ok(None);
         };
-        if record.object != object || *file != format!("v{}.json", record.version) {
-            return Ok(Err("its content names another object or version".to_owned()));
-        }
-        let manifest = match self.manifest(&record.manifest_digest).await {
-            Ok(Some(bytes)) => Manifest::decode(&bytes),
-            Ok(None) => {
-                return Ok(Err(format!(
-                    "manifest {} is absent",
-                    record.manifest_digest
-                )));
+        let parsed = self.object_of(path).and_then(|(object, file)| {
+            let record: VersionRecord =
+                serde_json::from_slice(&bytes).map_err(|error| error.to_string())?;
+            if record.object == object && file == format!("v{}.json", record.version) {
+                Ok(record)
+            } else {
+                Err("its content names another object or version".to_owned())
             }
-            Err(error @ RegistryError::Damaged { .. }) => return Ok(Err(error.to_string())),
+        });
+        let record = match parsed {
+            Ok(record) => record,
+            Err(reason) => return Ok(Some(Err(reason))),
+        };
+        let manifest = match self.manifest(&record.manifest_digest).await {
+            Ok(Some(bytes)) => Manifest::decode(&bytes).map_err(|error| error.to_string()),
+            Ok(None) => Err(format!("manifest {} is absent", record.manifest_digest)),
+            Err(error @ RegistryError::Damaged { .. }) => Err(error.to_string()),
             Err(error) => return Err(error),
         };
-        match manifest {
-            Ok(manifest) if manifest.kind() == Kind::Bundle => {
-                match self.check_blobs(&manifest).await {
-                    Ok(()) => Ok(Ok(Record::Version(record))),
-                    Err(error @ RegistryError::BlobsMissing { .. }) => Ok(Err(error.to_string())),
-                    Err(error) => Err(error),
-                }
+        let manifest = match manifest {
+            Ok(manifest) if manifest.kind() == Kind::Bundle => manifest,
+            Ok(_) => {
+                let reason = format!("manifest {} is no bundle's", record.manifest_digest);
+                return Ok(Some(Err(reason)));
             }
-            Ok(_) => Ok(Err(format!(
-                "manifest {} is no bundle's",
-                record.manifest_digest
-            ))),
-            Err(error) => Ok(Err(error.to_string())),
+            Err(reason) => return Ok(Some(Err(reason))),
+        };
+        let retired = states
+            .get(&record.object)
+            .is_some_and(|state| state.retired.contains(&record.version));
+        if !retired {
+            match self.check_blobs(&manifest).await {
+                Ok(()) => {}
+                Err(error @ RegistryError::BlobsMissing { .. }) => {
+                    return Ok(Some(Err(error.to_string())));
+                }
+                Err(error) => return Err(error),
+            }
         }
+        Ok(Some(Ok(Published {
+            file_count: manifest.files().len() as u32,
+            record,
+        })))
     }
 }
 
-enum Record {
-    Version(VersionRecord),
-    State(ObjectName, ObjectState),
-}
+/// A record, or why it cannot be used.
+type Read<T> = Result<T, String>;
 
 fn to_json<T: Serialize>(path: &Path, value: &T) -> Result<Bytes, RegistryError> {
     let mut bytes = serde_json::to_vec_pretty(value).map_err(|error| RegistryError::Damaged {

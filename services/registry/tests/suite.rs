@@ -7,7 +7,10 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
 use ign_proto::{Digest, FileEntry, JobId, Kind, Manifest, ObjectName};
-use ign_registry::{BodyError, ObjectState, Registry, RegistryError, StoreConfig, VersionRecord};
+use ign_registry::{
+    BodyError, Keep, ObjectState, Outcome, Published, Registry, RegistryError, StoreConfig,
+    VersionRecord,
+};
 use ign_testkit::S3;
 
 const NO_LIMIT: u64 = u64::MAX;
@@ -75,6 +78,10 @@ suite!(
     uploads_belong_to_their_object_and_expire,
     manifests_need_their_blobs,
     versions_are_written_once_and_rebuilt,
+    what_nothing_names_goes_slowly,
+    a_collection_at_any_point_of_a_submit_loses_nothing,
+    a_database_that_knows_less_than_the_bucket_collects_nothing,
+    an_audit_finds_and_repairs_what_rotted,
 );
 
 fn body(
@@ -362,6 +369,7 @@ async fn versions_are_written_once_and_rebuilt(fixture: Fixture) {
     let state = ObjectState {
         aliases: [("latest".to_owned(), 10)].into(),
         retired: [1].into(),
+        retired_at: [(1, v1.created_at)].into(),
     };
     registry.put_state(&object(), &state).await.unwrap();
 
@@ -371,7 +379,11 @@ async fn versions_are_written_once_and_rebuilt(fixture: Fixture) {
         .rebuild()
         .await
         .unwrap();
-    assert_eq!(rebuilt.versions, [v1.clone(), v10]);
+    let published = |record: &VersionRecord| Published {
+        record: record.clone(),
+        file_count: 1,
+    };
+    assert_eq!(rebuilt.versions, [published(&v1), published(&v10)]);
     assert_eq!(rebuilt.states, BTreeMap::from([(object(), state)]));
     assert_eq!(rebuilt.faults, []);
 
@@ -388,6 +400,275 @@ async fn versions_are_written_once_and_rebuilt(fixture: Fixture) {
         faults[0].0.ends_with("v11.json") && faults[0].1.contains("absent"),
         "{faults:?}"
     );
+}
+
+const HOUR: Duration = Duration::from_hours(1);
+
+impl Fixture {
+    /// Makes everything in the store two hours older.
+    fn age(&self) {
+        for path in walk(&self.folder) {
+            let file = std::fs::File::options().write(true).open(path).unwrap();
+            let before = file.metadata().unwrap().modified().unwrap();
+            file.set_modified(before - 2 * HOUR).unwrap();
+        }
+    }
+
+    fn blob(&self, digest: &Digest) -> std::path::PathBuf {
+        self.folder.join(format!(
+            "blobs/sha256/{}/{}",
+            &digest.hex()[..2],
+            digest.hex()
+        ))
+    }
+}
+
+fn walk(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        if entry.file_type().unwrap().is_dir() {
+            found.extend(walk(&entry.path()));
+        } else {
+            found.push(entry.path());
+        }
+    }
+    found
+}
+
+fn keeping(manifests: &[&Digest]) -> Keep {
+    Keep {
+        manifests: manifests.iter().copied().cloned().collect(),
+        ..Keep::default()
+    }
+}
+
+async fn what_nothing_names_goes_slowly(fixture: Fixture) {
+    let registry = &fixture.registry;
+    let kept = bundle(registry, b"kept").await;
+    let kept_digest = registry.put_manifest(&kept).await.unwrap();
+    let gone = bundle(registry, b"gone").await;
+    let gone_digest = registry.put_manifest(&gone).await.unwrap();
+    let checkpoint = registry.put_bytes(pattern(100)).await.unwrap();
+    let retired = bundle(registry, b"retired").await;
+    let retired_digest = registry.put_manifest(&retired).await.unwrap();
+    let keep = Keep {
+        manifests: [kept_digest.clone()].into(),
+        blobs: [checkpoint.clone()].into(),
+        versions: [
+            ((object(), 1), kept_digest.clone()),
+            ((object(), 2), retired_digest.clone()),
+        ]
+        .into(),
+    };
+    // Young: everything stays.
+    let collected = registry.collect(&keep, HOUR, false).await.unwrap();
+    assert_eq!(
+        (collected.trashed.objects, collected.deleted.objects),
+        (0, 0)
+    );
+    assert!(collected.young.objects >= 2, "{collected:?}");
+
+    fixture.age();
+    let upload = registry.create_upload(&object()).await.unwrap();
+    let fresh = registry
+        .put_bytes(Bytes::from_static(b"fresh"))
+        .await
+        .unwrap();
+    let dry = registry.collect(&keep, HOUR, true).await.unwrap();
+    // The manifest and blob of `gone`; of `retired` the blob alone.
+    assert_eq!(dry.trashed.objects, 3);
+    assert_eq!(dry.young.objects, 1);
+    assert_eq!(
+        registry.collect(&keep, HOUR, true).await.unwrap(),
+        dry,
+        "a dry run changes nothing"
+    );
+    assert_eq!(registry.collect(&keep, HOUR, false).await.unwrap(), dry);
+    let after = registry.collect(&keep, HOUR, false).await.unwrap();
+    assert_eq!(after.trashed.objects, 0);
+    assert_eq!((after.waiting, after.deleted.objects), (dry.trashed, 0));
+
+    // Who asks for it gets it back, and nothing else was touched.
+    let gone_blob = gone.files()[0].digest.clone();
+    assert!(!fixture.blob(&gone_blob).exists());
+    assert_eq!(content(registry, &gone_blob, None).await.unwrap(), b"gone");
+    assert!(fixture.blob(&gone_blob).exists());
+    assert!(registry.manifest(&retired_digest).await.unwrap().is_some());
+    for blob in [&checkpoint, &fresh, &kept.files()[0].digest] {
+        assert!(fixture.blob(blob).exists());
+    }
+    assert_eq!(registry.upload_offset(&object(), upload).await.unwrap(), 0);
+
+    // After another grace it is deleted; what is named again meanwhile comes back first.
+    let keep = Keep {
+        manifests: [kept_digest, gone_digest.clone()].into(),
+        ..keep
+    };
+    let last = registry
+        .collect(&keep, Duration::ZERO, false)
+        .await
+        .unwrap();
+    assert_eq!(last.rescued.objects, 1, "the manifest of `gone`: {last:?}");
+    assert_eq!(last.deleted.objects, 1, "the blob of `retired`: {last:?}");
+    let retired_blob = &retired.files()[0].digest;
+    assert_eq!(registry.blob_size(retired_blob).await.unwrap(), None);
+    registry.check_blobs(&gone).await.unwrap();
+    assert!(registry.manifest(&gone_digest).await.unwrap().is_some());
+}
+
+/// A client finds that the store has its files from long ago, so it sends none; then it puts the manifest, and submits.
+/// Two collections come between any of these steps.
+async fn a_collection_at_any_point_of_a_submit_loses_nothing(fixture: Fixture) {
+    let registry = &fixture.registry;
+    const STEPS: usize = 4;
+    for first in 0..=STEPS {
+        for second in first..=STEPS {
+            let bytes = Bytes::from(format!("{first} {second}"));
+            let digest = registry.put_bytes(bytes.clone()).await.unwrap();
+            let file = FileEntry {
+                path: "mesh.ply".parse().unwrap(),
+                digest: digest.clone(),
+                size_bytes: bytes.len() as u64,
+                media_type: "application/octet-stream".to_owned(),
+            };
+            let capture = Manifest::new(Kind::Capture, vec![file], BTreeMap::new()).unwrap();
+            fixture.age();
+            let mut named: Option<Digest> = None;
+            for step in 0..=STEPS {
+                for point in [first, second] {
+                    if point == step {
+                        let keep = keeping(&named.iter().collect::<Vec<_>>());
+                        registry.collect(&keep, HOUR, false).await.unwrap();
+                    }
+                }
+                match step {
+                    0 => assert_eq!(
+                        registry.blob_size(&digest).await.unwrap(),
+                        Some(bytes.len() as u64)
+                    ),
+                    1 => {
+                        registry.put_manifest(&capture).await.unwrap();
+                    }
+                    2 => {
+                        let there = Digest::of(&capture.encode().unwrap());
+                        let found = registry.manifest_to_name(&there).await.unwrap();
+                        assert_eq!(found.as_ref(), Some(&capture));
+                    }
+                    3 => named = Some(Digest::of(&capture.encode().unwrap())),
+                    _ => {}
+                }
+            }
+            fixture.age();
+            let keep = keeping(&[named.as_ref().unwrap()]);
+            for _ in 0..2 {
+                registry.collect(&keep, HOUR, false).await.unwrap();
+            }
+            registry.check_blobs(&capture).await.unwrap();
+            assert_eq!(content(registry, &digest, None).await.unwrap(), bytes);
+        }
+    }
+}
+
+async fn a_database_that_knows_less_than_the_bucket_collects_nothing(fixture: Fixture) {
+    let registry = &fixture.registry;
+    let manifest = bundle(registry, b"one").await;
+    let manifest_digest = registry.put_manifest(&manifest).await.unwrap();
+    let record = VersionRecord {
+        object: object(),
+        version: 1,
+        manifest_digest: manifest_digest.clone(),
+        size_bytes: manifest.size_bytes(),
+        job_id: JobId::generate(),
+        created_at: chrono::DateTime::from_timestamp(1_700_000_000, 0).unwrap(),
+        metrics_json: "{}".to_owned(),
+    };
+    registry.put_version(&record).await.unwrap();
+    fixture.age();
+    let refused = registry.collect(&Keep::default(), HOUR, false).await;
+    assert!(
+        matches!(&refused, Err(RegistryError::VersionUnknown { path }) if path.ends_with("v1.json")),
+        "{refused:?}"
+    );
+    registry.check_blobs(&manifest).await.unwrap();
+
+    // Nor one whose manifest cannot be read: nobody knows what it names.
+    let keep = Keep {
+        manifests: [manifest_digest.clone()].into(),
+        versions: [((object(), 1), manifest_digest.clone())].into(),
+        ..Keep::default()
+    };
+    let path = fixture.folder.join(format!(
+        "manifests/sha256/{}/{}",
+        &manifest_digest.hex()[..2],
+        manifest_digest.hex()
+    ));
+    std::fs::remove_file(path).unwrap();
+    let refused = registry.collect(&keep, HOUR, false).await;
+    assert!(
+        matches!(&refused, Err(RegistryError::Damaged { .. })),
+        "{refused:?}"
+    );
+    registry.check_blobs(&manifest).await.unwrap();
+}
+
+async fn an_audit_finds_and_repairs_what_rotted(fixture: Fixture) {
+    let registry = &fixture.registry;
+    let manifest = bundle(registry, b"one").await;
+    let named = [registry.put_manifest(&manifest).await.unwrap()].into();
+    let other = registry.put_bytes(pattern(1000)).await.unwrap();
+    let clean = registry.audit(None, &named, None).await.unwrap();
+    // Two blobs, the empty config, the manifest.
+    assert_eq!((clean.read.objects, clean.faults.len()), (4, 0));
+
+    let replica_keep = tempfile::tempdir().unwrap();
+    let config = StoreConfig::new(format!("file://{}", replica_keep.path().display()));
+    let copy = Registry::open(&config).await.unwrap();
+    copy.put_bytes(Bytes::from_static(b"one")).await.unwrap();
+    let replica = Registry::connect(&config).unwrap();
+
+    let one = manifest.files()[0].digest.clone();
+    for damage in ["rotten", "absent"] {
+        std::fs::write(fixture.blob(&other), b"rotten").unwrap();
+        if damage == "rotten" {
+            std::fs::write(fixture.blob(&one), b"onE").unwrap();
+        } else {
+            std::fs::remove_file(fixture.blob(&one)).unwrap();
+        }
+        let audit = registry.audit(None, &named, Some(&replica)).await.unwrap();
+        let outcome = |digest: &Digest| {
+            let of = |fault: &&ign_registry::Fault| fault.path.ends_with(digest.hex());
+            audit.faults.iter().find(of).map(|fault| fault.outcome)
+        };
+        assert_eq!(audit.faults.len(), 2, "{damage}: {audit:?}");
+        assert_eq!(outcome(&one), Some(Outcome::Repaired));
+        assert_eq!(outcome(&other), Some(Outcome::SetAside));
+        assert_eq!(content(registry, &one, None).await.unwrap(), b"one");
+        // Nobody is served wrong bytes, and sending the right ones repairs it.
+        assert_eq!(registry.blob_size(&other).await.unwrap(), None);
+        registry.put_bytes(pattern(1000)).await.unwrap();
+    }
+    // A replica that rotted too repairs nothing.
+    let in_replica =
+        replica_keep
+            .path()
+            .join(format!("blobs/sha256/{}/{}", &one.hex()[..2], one.hex()));
+    std::fs::write(in_replica, b"onE").unwrap();
+    std::fs::remove_file(fixture.blob(&one)).unwrap();
+    let audit = registry.audit(None, &named, Some(&replica)).await.unwrap();
+    assert_eq!(audit.faults.len(), 1);
+    assert_eq!(audit.faults[0].outcome, Outcome::Absent);
+    // By slices each object is read once.
+    registry
+        .put_bytes(Bytes::from_static(b"one"))
+        .await
+        .unwrap();
+    let mut objects = 0;
+    for byte in 0..=255 {
+        let audit = registry.audit(Some(byte), &named, None).await.unwrap();
+        assert_eq!(audit.faults, []);
+        objects += audit.read.objects;
+    }
+    assert_eq!(objects, 4);
 }
 
 #[tokio::test]

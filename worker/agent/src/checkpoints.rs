@@ -183,11 +183,13 @@ async fn send(
     };
     data.push(&state.object, path, &digest, size_bytes, session)
         .await?;
+    ign_faults::point("agent.checkpoint_sent");
     let request = v1::CheckpointRequest {
         job: Some(state.token()),
         digest: digest.to_string(),
         size_bytes,
     };
     control.checkpoint(request).await?;
+    ign_faults::point("agent.checkpoint_told");
     Ok(size_bytes)
 }

@@ -65,6 +65,7 @@ pub(crate) async fn run(agent: &Agent, lease: v1::Lease, shutdown: &Cancellation
             return Next::Work;
         }
     };
+    ign_faults::point("agent.leased");
     let state = Arc::new(state);
     let started = Instant::now();
     tracing::info!(job = %state.job, attempt = %state.attempt, object = %state.object, "job started");
@@ -160,6 +161,7 @@ impl Job<'_> {
         let job_file = self
             .unless_stopped(Duration::ZERO, self.prepare(spec))
             .await?;
+        ign_faults::point("agent.fetched");
         let bundle = self.bake(&job_file).await?;
         self.deliver(&bundle).await
     }
@@ -349,6 +351,7 @@ impl Job<'_> {
             let files = self
                 .unless_stopped(grace, async { Ok(transfer.send_bundle(bundle).await?) })
                 .await?;
+            ign_faults::point("agent.sent");
             let request = v1::CompleteRequest {
                 job: Some(self.state.token()),
                 files: files
@@ -363,7 +366,10 @@ impl Job<'_> {
                 metrics_json: summary(&bundle.join("metrics.json")),
             };
             match self.complete(request, &mut backoff).await? {
-                Completed::Version(version) => return Ok(version),
+                Completed::Version(version) => {
+                    ign_faults::point("agent.completed");
+                    return Ok(version);
+                }
                 Completed::BlobMissing(message) if resends == MAX_RESENDS => {
                     return Err(Ended::Failed(failure(FailureKind::Transient, &message, "")));
                 }

@@ -62,6 +62,7 @@ impl Service {
             behind_tls_proxy: false,
             limits: ign_coordinator::Limits::default(),
             redirect_blobs: true,
+            care: ign_coordinator::Care::default(),
         };
         let stop = CancellationToken::new();
         let running = ign_coordinator::serve(config, stop.clone().cancelled_owned())

@@ -119,6 +119,11 @@ fn calls(job: &str) -> Vec<(&'static str, Vec<u8>, Scope)> {
         ),
         ("Bundles/Retire", get_bundle().encode_to_vec(), Scope::Admin),
         (
+            "Bundles/Restore",
+            get_bundle().encode_to_vec(),
+            Scope::Admin,
+        ),
+        (
             "Collections/Set",
             v1::Collection {
                 name: museum(),
@@ -138,7 +143,11 @@ const OF_ALL_COLLECTIONS: [(&str, Scope); 3] = [
 ];
 
 /// Those for the holder of `admin` everywhere.
-const OF_OPERATORS: [&str; 4] = [
+const OF_OPERATORS: [&str; 8] = [
+    "Admin/RebuildRegistry",
+    "Admin/CollectGarbage",
+    "Admin/AuditRegistry",
+    "Admin/ListEvents",
     "Tokens/Create",
     "Tokens/List",
     "Tokens/Rotate",

@@ -5,7 +5,8 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use ign_coordinator::{Config, Limits, Running, serve};
+use ign_coordinator::{Care, Config, Limits, Running, serve};
+use ign_proto::v1::admin_client::AdminClient;
 use ign_proto::v1::bundles_client::BundlesClient;
 use ign_proto::v1::collections_client::CollectionsClient;
 use ign_proto::v1::jobs_client::JobsClient;
@@ -47,6 +48,7 @@ pub(crate) struct Service {
     pub(crate) bundles: BundlesClient<Authorized>,
     pub(crate) collections: CollectionsClient<Authorized>,
     pub(crate) tokens: TokensClient<Authorized>,
+    pub(crate) admin: AdminClient<Authorized>,
     pub(crate) http: reqwest::Client,
     pub(crate) folder: PathBuf,
     config: Config,
@@ -88,6 +90,7 @@ impl Service {
             tls: None,
             behind_tls_proxy: false,
             limits: Limits::default(),
+            care: Care::default(),
         };
         change(&mut config);
         let http = reqwest::Client::new();
@@ -99,6 +102,7 @@ impl Service {
             bundles,
             collections,
             tokens,
+            admin,
         } = Clients::new(&url, TOKEN);
         Self {
             url,
@@ -107,6 +111,7 @@ impl Service {
             bundles,
             collections,
             tokens,
+            admin,
             http,
             folder,
             config,
@@ -125,6 +130,11 @@ impl Service {
     /// As SIGHUP does.
     pub(crate) fn reload_certificates(&self) {
         self.running.as_ref().unwrap().0.reload_certificates()();
+    }
+
+    /// Changes what the next start cares for.
+    pub(crate) fn care(&mut self, change: impl FnOnce(&mut Care)) {
+        change(&mut self.config.care);
     }
 
     /// Stops the coordinator and waits for its end.
@@ -147,6 +157,7 @@ impl Service {
             bundles: self.bundles,
             collections: self.collections,
             tokens: self.tokens,
+            admin: self.admin,
         } = Clients::new(&self.url, TOKEN);
         self.running = Some((running, stop));
     }
@@ -324,6 +335,7 @@ pub(crate) struct Clients {
     pub(crate) bundles: BundlesClient<Authorized>,
     pub(crate) collections: CollectionsClient<Authorized>,
     pub(crate) tokens: TokensClient<Authorized>,
+    pub(crate) admin: AdminClient<Authorized>,
 }
 
 impl Clients {
@@ -336,7 +348,8 @@ impl Clients {
             workers: WorkersClient::new(authorized.clone()),
             bundles: BundlesClient::new(authorized.clone()),
             collections: CollectionsClient::new(authorized.clone()),
-            tokens: TokensClient::new(authorized),
+            tokens: TokensClient::new(authorized.clone()),
+            admin: AdminClient::new(authorized),
         }
     }
 }

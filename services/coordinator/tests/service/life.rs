@@ -259,10 +259,39 @@ async fn a_stale_attempt_is_told_so_and_nothing_of_it_shows() {
         .unwrap();
     assert_eq!(published.versions.len(), 1);
     assert_eq!(
-        published.versions[0].manifest_digest.as_str(),
+        published.versions[0].record.manifest_digest.as_str(),
         bundle.manifest_digest
     );
     assert_eq!(published.faults, []);
+}
+
+/// Leases run by the database's clock: a worker that is five minutes early or late holds its job as long as any other.
+#[tokio::test]
+async fn a_workers_clock_decides_nothing() {
+    let mut service =
+        Service::with(|config| config.settings = settings(Duration::from_millis(900))).await;
+    let job = service.submit("museum/vase", "request-1").await;
+    let lease = service.lease("skewed", 5.0).await.unwrap();
+    let now = chrono::Utc::now().timestamp();
+    for (seq, skew) in [(1, -300), (2, 300), (3, -300), (4, 300), (5, 0)] {
+        let line = v1::LogLine {
+            at: Some(prost_types::Timestamp {
+                seconds: now + skew,
+                nanos: 0,
+            }),
+            ..line(seq, "still here")
+        };
+        let heartbeat = v1::HeartbeatRequest {
+            job: Some(attempt(&lease, "skewed")),
+            logs: vec![line],
+            ..v1::HeartbeatRequest::default()
+        };
+        service.workers.heartbeat(heartbeat).await.unwrap();
+        assert!(service.lease("rival", 0.3).await.is_none(), "skew {skew} s");
+    }
+    // Silent, it loses the job as any other.
+    let rescued = service.lease("rival", 20.0).await.unwrap();
+    assert_eq!((rescued.job_id, rescued.attempt), (job.id, 2));
 }
 
 #[tokio::test]

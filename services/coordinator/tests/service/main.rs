@@ -8,4 +8,5 @@ mod life;
 mod limits;
 mod oci;
 mod operations;
+mod registry;
 mod tls;

@@ -124,6 +124,7 @@ async fn a_coordinator_that_cannot_work_says_why() {
             behind_tls_proxy: false,
             limits: ign_coordinator::Limits::default(),
             redirect_blobs: false,
+            care: ign_coordinator::Care::default(),
         };
         change(&mut config);
         ign_coordinator::serve(config, std::future::pending())

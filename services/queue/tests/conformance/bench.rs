@@ -20,20 +20,35 @@ pub(crate) const PATIENT: Settings = Settings {
     poll: Duration::from_millis(500),
 };
 
+/// A way into the database around the store.
+enum Beside {
+    Sqlite(sqlx::SqlitePool),
+    Postgres(sqlx::PgPool),
+}
+
 /// One database and a store on it.
 pub(crate) struct Bench {
     pub(crate) store: Arc<dyn Store>,
     pub(crate) url: String,
+    beside: Beside,
     _dir: Option<tempfile::TempDir>,
 }
 
 impl Bench {
     pub(crate) async fn sqlite() -> Self {
-        let dir = tempfile::tempdir().unwrap();
+        // In memory where the system has a place for that: the model takes many steps, each flushed to disk.
+        let memory = std::path::Path::new("/dev/shm");
+        let dir = if memory.is_dir() {
+            tempfile::tempdir_in(memory)
+        } else {
+            tempfile::tempdir()
+        };
+        let dir = dir.unwrap();
         let url = format!("sqlite://{}/ign.db", dir.path().display());
         let store = ign_queue::open(&url, PATIENT).await.unwrap();
         Self {
             store,
+            beside: Beside::Sqlite(sqlx::SqlitePool::connect_lazy(&url).unwrap()),
             url,
             _dir: Some(dir),
         }
@@ -47,6 +62,12 @@ impl Bench {
         let store = ign_queue::open(&url, PATIENT).await.unwrap();
         Self {
             store,
+            beside: Beside::Postgres(
+                sqlx::postgres::PgPoolOptions::new()
+                    .max_connections(1)
+                    .connect_lazy(&url)
+                    .unwrap(),
+            ),
             url,
             _dir: None,
         }
@@ -60,14 +81,9 @@ impl Bench {
     /// Runs SQL beside the store.
     pub(crate) async fn execute(&self, sql: String) {
         let sql = sqlx::AssertSqlSafe(sql);
-        if self.url.starts_with("sqlite") {
-            let pool = sqlx::SqlitePool::connect(&self.url).await.unwrap();
-            sqlx::query(sql).execute(&pool).await.unwrap();
-            pool.close().await;
-        } else {
-            let pool = sqlx::PgPool::connect(&self.url).await.unwrap();
-            sqlx::query(sql).execute(&pool).await.unwrap();
-            pool.close().await;
+        match &self.beside {
+            Beside::Sqlite(pool) => sqlx::query(sql).execute(pool).await.map(drop).unwrap(),
+            Beside::Postgres(pool) => sqlx::query(sql).execute(pool).await.map(drop).unwrap(),
         }
     }
 
@@ -92,6 +108,24 @@ impl Bench {
     pub(crate) async fn end_backoff(&self, job: JobId) {
         self.execute(format!(
             "update jobs set not_before = {} where id = '{job}'",
+            self.past()
+        ))
+        .await;
+    }
+
+    /// Makes it long ago that the job ended.
+    pub(crate) async fn end_long_ago(&self, job: JobId) {
+        self.execute(format!(
+            "update jobs set finished_at = {} where id = '{job}'",
+            self.past()
+        ))
+        .await;
+    }
+
+    /// Makes it long ago that versions were retired.
+    pub(crate) async fn retire_long_ago(&self) {
+        self.execute(format!(
+            "update versions set retired_at = {} where retired_at is not null",
             self.past()
         ))
         .await;

@@ -18,10 +18,6 @@ use crate::bench::{
     Bench, PATIENT, after, bundle, digest, failure, kind, name, request, spec, worker,
 };
 
-pub(crate) async fn random_operations_match_the_model(bench: &Bench) {
-    crate::model::run(bench).await;
-}
-
 fn line(source_seq: u64, message: &str) -> NewLogLine {
     NewLogLine {
         source_seq,
@@ -1106,8 +1102,21 @@ pub(crate) async fn aliases_and_retirement(bench: &Bench) {
         kind(&bench.store.set_alias(&vase, "v3", "approved").await),
         "not allowed"
     );
-    assert!(bench.store.retire(&vase, "v3").await.unwrap().retired);
-    assert!(bench.store.version(&vase, "v3").await.unwrap().retired);
+    let retired = bench.store.version(&vase, "v3").await.unwrap();
+    assert!(retired.retired && retired.retired_at.is_some());
+    // A repeated call does not prolong the grace.
+    let again = bench.store.retire(&vase, "v3").await.unwrap();
+    assert_eq!(again, retired);
+    let restored = bench.store.restore(&vase, "v3").await.unwrap();
+    assert_eq!((restored.retired, restored.retired_at), (false, None));
+    assert_eq!(restored.aliases, ["latest"]);
+    assert_eq!(
+        bench.store.restore(&vase, "v3").await.unwrap(),
+        restored,
+        "a repeated call changes nothing"
+    );
+    assert_eq!(kind(&bench.store.restore(&vase, "v9").await), "not found");
+    bench.store.retire(&vase, "v3").await.unwrap();
 
     let list = async |filter: VersionFilter| -> Vec<String> {
         let versions = bench.store.versions(&filter).await.unwrap();
@@ -1315,4 +1324,137 @@ pub(crate) async fn data_outlive_the_store(bench: &Bench) {
     assert_eq!(bench.store.get(job.id).await.unwrap().version, Some(1));
     let unknown = ign_queue::open("mysql://host/db", PATIENT).await;
     assert!(matches!(unknown, Err(StoreError::Invalid { .. })));
+}
+
+/// A wiped database takes everything over that the bucket records, and nothing twice.
+pub(crate) async fn versions_are_adopted(bench: &Bench) {
+    let vase = name("museum/vase");
+    let known = |number: u32| ign_queue::Version {
+        object: vase.clone(),
+        version: number,
+        bundle: bundle(number as u8),
+        aliases: Vec::new(),
+        created_at: chrono::DateTime::from_timestamp(1_700_000_000, 123_456_000).unwrap(),
+        job: JobId::generate(),
+        retired: false,
+        retired_at: None,
+    };
+    let mut versions = vec![known(1), known(2), known(4)];
+    versions[0].aliases = vec!["approved".to_owned()];
+    versions[2].aliases = vec!["latest".to_owned()];
+    versions[1].retired = true;
+    versions[1].retired_at = Some(versions[1].created_at);
+    let adopted = bench.store.adopt(&vase, &versions).await.unwrap();
+    assert_eq!(
+        (adopted.added.as_slice(), adopted.known),
+        (&[1, 2, 4][..], 0)
+    );
+    let all = VersionFilter {
+        include_retired: true,
+        ..VersionFilter::default()
+    };
+    assert_eq!(bench.store.versions(&all).await.unwrap(), versions);
+    let again = bench.store.adopt(&vase, &versions).await.unwrap();
+    assert_eq!((again.added.len(), again.known), (0, 3));
+
+    // Numbers go on after the last one, and what the database decided since then stands.
+    let job = bench.running("museum/vase").await;
+    let next = bench
+        .store
+        .publish_and_complete(job.id, job.attempt, bundle(5))
+        .await
+        .unwrap();
+    assert_eq!(next.version, 5);
+    let mut foreign = known(5);
+    foreign.aliases = vec!["latest".to_owned(), "approved".to_owned()];
+    let refused = bench.store.adopt(&vase, &[foreign]).await.unwrap();
+    assert_eq!(refused.differing, [5]);
+    bench.store.adopt(&vase, &versions).await.unwrap();
+    let latest = bench.store.version(&vase, "latest").await.unwrap();
+    assert_eq!((latest.version, latest.job), (5, job.id));
+    let approved = bench.store.version(&vase, "approved").await.unwrap();
+    assert_eq!(approved.version, 1);
+}
+
+/// Garbage collection spares what the database names, and for the grace what it named lately.
+pub(crate) async fn what_is_named_is_known(bench: &Bench) {
+    let hour = std::time::Duration::from_hours(1);
+    let vase = name("museum/vase");
+    let with_capture = |number: u8| Submit {
+        spec: JobSpec {
+            capture_digest: digest(number),
+            ..spec("museum/vase")
+        },
+        ..request("museum/vase")
+    };
+    let first = bench.store.submit(with_capture(1)).await.unwrap();
+    let job = bench.lease("w").await.unwrap();
+    let checkpoint = Checkpoint {
+        digest: digest(2),
+        size_bytes: 9,
+    };
+    bench
+        .store
+        .checkpoint(job.id, job.attempt, checkpoint)
+        .await
+        .unwrap();
+    let named = bench.store.named(hour).await.unwrap();
+    assert_eq!(named.manifests, [digest(1)].into());
+    assert_eq!(named.checkpoints, [digest(2)].into());
+
+    bench
+        .store
+        .publish_and_complete(job.id, job.attempt, bundle(3))
+        .await
+        .unwrap();
+    bench.store.submit(with_capture(4)).await.unwrap();
+    let named = bench.store.named(hour).await.unwrap();
+    assert_eq!(named.manifests, [digest(1), digest(3), digest(4)].into());
+    assert_eq!(named.checkpoints, [digest(2)].into());
+    // The job ended longer ago than the grace: its capture and checkpoint may go, its version stays.
+    bench.end_long_ago(first.id).await;
+    let named = bench.store.named(hour).await.unwrap();
+    assert_eq!(named.manifests, [digest(3), digest(4)].into());
+    assert_eq!(named.checkpoints, [].into());
+
+    bench.store.retire(&vase, "v1").await.unwrap();
+    let named = bench.store.named(hour).await.unwrap();
+    assert!(named.manifests.contains(&digest(3)));
+    // A coordinator of the version before retires without a time: the grace begins when it is seen.
+    bench
+        .execute("update versions set retired_at = null".to_owned())
+        .await;
+    let named = bench.store.named(hour).await.unwrap();
+    assert!(named.manifests.contains(&digest(3)));
+    bench.retire_long_ago().await;
+    let named = bench.store.named(hour).await.unwrap();
+    assert_eq!(named.manifests, [digest(4)].into());
+}
+
+pub(crate) async fn events_and_turns(bench: &Bench) {
+    for number in 0..3 {
+        bench
+            .store
+            .record("audit", &format!("s{number}"), "all well\0")
+            .await
+            .unwrap();
+    }
+    let events = bench.store.events(0, 2).await.unwrap();
+    let subjects: Vec<&str> = events.iter().map(|event| event.subject.as_str()).collect();
+    assert_eq!(subjects, ["s2", "s1"]);
+    assert_eq!(events[0].message, "all well\u{FFFD}");
+    let rest = bench.store.events(events[1].seq, 9).await.unwrap();
+    assert_eq!((rest.len(), rest[0].subject.as_str()), (1, "s0"));
+
+    let hour = std::time::Duration::from_hours(1);
+    let mut tasks = tokio::task::JoinSet::new();
+    for _ in 0..8 {
+        let store = bench.store.clone();
+        tasks.spawn(async move { store.take_turn("audit", hour).await.unwrap() });
+    }
+    let turns: Vec<u64> = tasks.join_all().await.into_iter().flatten().collect();
+    assert_eq!(turns, [0], "one of eight has the turn");
+    let zero = std::time::Duration::ZERO;
+    assert_eq!(bench.store.take_turn("audit", zero).await.unwrap(), Some(1));
+    assert_eq!(bench.store.take_turn("other", hour).await.unwrap(), Some(0));
 }

@@ -38,6 +38,7 @@ conformance![
     concurrent_publications_of_one_object_get_distinct_versions,
     data_outlive_the_store,
     drained_workers_get_nothing,
+    events_and_turns,
     failures_decide_by_kind,
     find_takes_unambiguous_prefixes,
     flood_of_one_collection_does_not_starve_another,
@@ -51,13 +52,25 @@ conformance![
     order_is_priority_then_age,
     paused_collections_wait,
     publish_is_idempotent,
-    random_operations_match_the_model,
     stale_attempts_change_nothing,
     status_shows_one_screen,
     submits_are_idempotent,
     tokens_rotate_expire_and_end,
+    versions_are_adopted,
     waiting_jobs_say_why,
     weights_share_the_workers,
+    what_is_named_is_known,
     workers_stay_within_their_collections,
     worthless_requests_are_refused,
 ];
+
+/// A hundred thousand steps on one store, ten thousand on the other, which takes a server and is slower.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn random_operations_on_sqlite_match_the_model() {
+    model::rounds(50, bench::Bench::sqlite).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn random_operations_on_postgres_match_the_model() {
+    model::rounds(5, bench::Bench::postgres).await;
+}

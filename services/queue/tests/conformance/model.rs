@@ -4,7 +4,8 @@
 //! After each operation the answers are compared, and now and then the whole content. Times are compared by presence:
 //! the store's are the database's, the model's are counted.
 //!
-//! `IGN_MODEL_STEPS` and `IGN_MODEL_SEED` run it longer or elsewhere.
+//! The steps are split into rounds, each with a seed and a database of its own, so that neither the queue nor the model
+//! grows without end. `IGN_MODEL_ROUNDS` and `IGN_MODEL_SEED` run it longer or elsewhere.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Debug;
@@ -158,6 +159,7 @@ impl Model {
                 created_at: now,
                 job: id,
                 retired: false,
+                retired_at: None,
             },
         );
         self.aliases
@@ -209,10 +211,11 @@ impl Model {
             return Err("not allowed");
         }
         let number = version.version;
-        self.versions
-            .get_mut(&(object.clone(), number))
-            .expect("resolved")
-            .retired = true;
+        let at = (object.clone(), number);
+        let now = self.now();
+        let row = self.versions.get_mut(&at).expect("resolved");
+        row.retired = true;
+        row.retired_at.get_or_insert(now);
         let newest = self
             .versions
             .values()
@@ -227,6 +230,30 @@ impl Model {
             };
         }
         Ok(self.version(object, number))
+    }
+}
+
+impl Model {
+    fn restore(&mut self, object: &ObjectName, reference: &str) -> Answer<Version> {
+        let version = self.resolve(object, reference)?;
+        if version.retired {
+            let at = (object.clone(), version.version);
+            let row = self.versions.get_mut(&at).expect("resolved");
+            row.retired = false;
+            row.retired_at = None;
+            let listed = |(of, _): &&(ObjectName, u32)| of == object;
+            let newest = self
+                .versions
+                .keys()
+                .filter(listed)
+                .filter(|at| !self.versions[at].retired)
+                .map(|(_, number)| *number)
+                .max()
+                .expect("one was just restored");
+            self.aliases
+                .insert((object.clone(), "latest".to_owned()), newest);
+        }
+        Ok(self.version(object, version.version))
     }
 }
 
@@ -247,6 +274,7 @@ fn timeless(mut job: Job) -> Job {
 fn version_timeless(version: Version) -> Version {
     Version {
         created_at: PAST,
+        retired_at: version.retired_at.map(|_| PAST),
         ..version
     }
 }
@@ -315,9 +343,19 @@ async fn compare_all(bench: &Bench, model: &Model, step: u64) {
     }
 }
 
-pub(crate) async fn run(bench: &Bench) {
-    let steps = from_env("IGN_MODEL_STEPS", 2000);
-    let mut rng = Pcg64Mcg::new(u128::from(from_env("IGN_MODEL_SEED", 11)));
+/// Steps of one round.
+const STEPS: u64 = 2000;
+
+/// Rounds of random operations, each on what `fresh` gives.
+pub(crate) async fn rounds(default: u64, fresh: impl AsyncFn() -> Bench) {
+    let first = from_env("IGN_MODEL_SEED", 11);
+    for round in 0..from_env("IGN_MODEL_ROUNDS", default) {
+        Box::pin(run(&fresh().await, first + round, STEPS)).await;
+    }
+}
+
+async fn run(bench: &Bench, seed: u64, steps: u64) {
+    let mut rng = Pcg64Mcg::new(u128::from(seed));
     let mut model = Model::default();
     let store = &bench.store;
     for step in 0..steps {
@@ -570,7 +608,11 @@ pub(crate) async fn run(bench: &Bench) {
                     1 => "approved".to_owned(),
                     _ => format!("v{}", rng.random_range(0..=number + 1)),
                 };
-                if rng.random_bool(0.5) {
+                if rng.random_bool(0.3) {
+                    let expected = model.restore(&object, &reference).map(version_timeless);
+                    let result = store.restore(&object, &reference).await;
+                    same(step, "restore", result.map(version_timeless), expected);
+                } else if rng.random_bool(0.5) {
                     let expected = model
                         .set_alias(&object, &reference, "approved")
                         .map(version_timeless);
@@ -590,7 +632,7 @@ pub(crate) async fn run(bench: &Bench) {
                 }
             }
         }
-        if step % 100 == 0 || step + 1 == steps {
+        if step % 200 == 0 || step + 1 == steps {
             compare_all(bench, &model, step).await;
         }
     }

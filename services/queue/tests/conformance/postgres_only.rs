@@ -89,3 +89,143 @@ async fn a_restarted_server_is_an_outage_and_not_a_loss() {
         Some(job.id)
     );
 }
+
+/// Repeats a call while the database is away.
+async fn insist<T, F: Future<Output = ign_queue::store::Result<T>>>(call: impl Fn() -> F) -> T {
+    let deadline = Instant::now() + Duration::from_mins(1);
+    loop {
+        match call().await {
+            Ok(value) => return value,
+            Err(StoreError::Unavailable { .. }) if Instant::now() < deadline => {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+            Err(error) => panic!("{error:?}"),
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn three_hundred_clients_share_a_small_pool() {
+    let bench = Bench::postgres().await;
+    let begun = Instant::now();
+    let mut tasks = tokio::task::JoinSet::new();
+    for index in 0..300 {
+        let store = bench.store.clone();
+        tasks.spawn(async move {
+            let request = request("museum/vase");
+            let job = insist(|| store.submit(request.clone())).await;
+            let me = worker(&format!("w{index}"));
+            let leased = loop {
+                // None while the last rows are in others' hands.
+                if let Some(leased) = insist(|| store.lease(&me)).await {
+                    break leased;
+                }
+            };
+            insist(|| store.heartbeat(leased.id, leased.attempt, None, Vec::new())).await;
+            insist(|| store.status(None, 5)).await;
+            (job.id, leased.id)
+        });
+    }
+    let (submitted, leased): (BTreeSet<_>, BTreeSet<_>) =
+        tasks.join_all().await.into_iter().unzip();
+    assert_eq!(submitted.len(), 300);
+    assert_eq!(leased, submitted, "each job went to one client");
+    assert!(
+        begun.elapsed() < Duration::from_mins(1),
+        "{:?}",
+        begun.elapsed()
+    );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn killed_connections_lose_and_double_nothing() {
+    let bench = Bench::postgres().await;
+    let admin = sqlx::PgPool::connect(&bench.url).await.unwrap();
+    let done = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let killer = tokio::spawn({
+        let done = done.clone();
+        async move {
+            let mut killed = 0_usize;
+            while !done.load(std::sync::atomic::Ordering::Relaxed) {
+                let ended: Vec<bool> = sqlx::query_scalar(
+                    "select pg_terminate_backend(pid) from pg_stat_activity \
+                     where datname = current_database() and application_name = 'ign'",
+                )
+                .fetch_all(&admin)
+                .await
+                .unwrap();
+                killed += ended.len();
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+            killed
+        }
+    });
+    let mut tasks = tokio::task::JoinSet::new();
+    for index in 0..8 {
+        let store = bench.store.clone();
+        tasks.spawn(async move {
+            let me = worker(&format!("w{index}"));
+            let mut acknowledged = Vec::new();
+            for number in 0..12_u8 {
+                let object = format!("museum/object-{index}-{number}");
+                let request = request(&object);
+                acknowledged.push(insist(|| store.submit(request.clone())).await.id);
+                // A lease whose answer was lost runs out; here nobody waits for that, others are leased.
+                if let Some(job) = insist(|| store.lease(&me)).await {
+                    let bundle = crate::bench::bundle(number);
+                    insist(|| store.publish_and_complete(job.id, job.attempt, bundle.clone()))
+                        .await;
+                }
+            }
+            acknowledged
+        });
+    }
+    let acknowledged: BTreeSet<_> = tasks.join_all().await.into_iter().flatten().collect();
+    done.store(true, std::sync::atomic::Ordering::Relaxed);
+    assert!(
+        killer.await.unwrap() > 20,
+        "hardly any connection was killed"
+    );
+    assert_eq!(acknowledged.len(), 96);
+    let every = ign_queue::VersionFilter::default();
+    let all = insist(|| bench.store.versions(&every)).await;
+    let jobs: BTreeSet<_> = all.iter().map(|version| version.job).collect();
+    assert_eq!(jobs.len(), all.len(), "a job published twice");
+    assert!(jobs.is_subset(&acknowledged) && !jobs.is_empty());
+    for id in acknowledged {
+        let job = insist(|| bench.store.get(id)).await;
+        job.check().unwrap();
+        assert_eq!(job.version.is_some(), jobs.contains(&id));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_transaction_held_open_holds_up_its_rows_alone_and_not_for_ever() {
+    let bench = Bench::postgres().await;
+    let held = bench.submit("museum/vase").await;
+    let other = bench.submit("museum/urn").await;
+    let pool = sqlx::PgPool::connect(&bench.url).await.unwrap();
+    let mut transaction = pool.begin().await.unwrap();
+    sqlx::query("select * from jobs where id = $1 for update")
+        .bind(held.id.as_uuid())
+        .execute(&mut *transaction)
+        .await
+        .unwrap();
+    // Claims pass it by.
+    assert_eq!(bench.lease("w").await.map(|job| job.id), Some(other.id));
+    assert_eq!(bench.lease("w").await, None);
+    bench.store.reap().await.unwrap();
+    bench.store.status(None, 5).await.unwrap();
+    let begun = Instant::now();
+    match bench.store.cancel(held.id).await {
+        Err(StoreError::Unavailable { determinate, .. }) => assert!(determinate),
+        other => panic!("a row that is held gave {other:?}"),
+    }
+    assert!(
+        begun.elapsed() < Duration::from_secs(20),
+        "{:?}",
+        begun.elapsed()
+    );
+    transaction.rollback().await.unwrap();
+    bench.store.cancel(held.id).await.unwrap();
+}

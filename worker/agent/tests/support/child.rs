@@ -1,4 +1,5 @@
-//! Stands in for `ign-worker exec`: plays the script in the job's recipe.
+//! Stands in for `ign-worker exec`: plays the script in the job's recipe. And for `ign-worker agent`, with itself as the
+//! child: `agent URL DIR NAME`.
 //!
 //! The recipe is `{"script": [step, ...]}`; see `main` for the steps. Like the real child it exits when its stdin
 //! reaches its end.
@@ -34,7 +35,37 @@ fn write_file(root: &Path, name: &str, content: &[u8]) {
     std::fs::write(path, content).unwrap();
 }
 
+/// An agent whose child is this program; ends when its stdin does.
+fn agent(url: &str, dir: &str, name: &str) {
+    let token = std::env::var("IGN_TEST_TOKEN").unwrap();
+    let config = ign_agent::AgentConfig {
+        name: Some(name.to_owned()),
+        threads: 1,
+        child: ign_agent::ChildCommand {
+            program: std::env::current_exe().unwrap(),
+            args: vec!["exec".into(), "--job".into()],
+            envs: Vec::new(),
+        },
+        lease_wait: std::time::Duration::from_secs(5),
+        ..ign_agent::AgentConfig::new(url, &token, Path::new(dir)).unwrap()
+    };
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .unwrap();
+    let never = tokio_util::sync::CancellationToken::new();
+    let ended = runtime.block_on(ign_agent::run(config, never));
+    println!("agent ended: {ended:?}");
+}
+
 fn main() {
+    let args: Vec<String> = std::env::args().collect();
+    if let [_, role, url, dir, name] = args.as_slice()
+        && role == "agent"
+    {
+        return agent(url, dir, name);
+    }
     std::thread::Builder::new()
         .spawn(|| {
             std::io::stdin().read_to_end(&mut Vec::new()).ok();
@@ -98,7 +129,9 @@ fn main() {
             })),
             "done" => {
                 let bundle = job.work_dir.join("bundle");
-                write_file(&bundle, "bundle.json", b"{}");
+                // No two attempts bake the same bytes.
+                let attempt = format!("{{\"attempt\":{}}}", job.attempt);
+                write_file(&bundle, "bundle.json", attempt.as_bytes());
                 write_file(
                     &bundle,
                     "metrics.json",
