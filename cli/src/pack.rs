@@ -2,8 +2,8 @@
 //!
 //! The list of files is the capture contract of DESIGN section 5: `images/`, `sparse/`, `masks/`, `mesh.*`,
 //! `test.txt`, `capture.toml`, another format's files of cameras with what they name, and another mesh only when it is
-//! the proxy. Faults of the content are not judged
-//! here: the worker's preflight does that for every way a capture may come in.
+//! the proxy; with a glTF go the buffer files that it names. Faults of the content are not judged here: the worker's
+//! preflight does that for every way a capture may come in.
 //! Invariant: the manifest depends on paths and contents alone, so the same capture has the same digest on every
 //! machine and is never stored or sent twice.
 
@@ -71,12 +71,61 @@ pub(crate) struct Packed {
 
 /// The proxy's path within the capture when it is given apart from it.
 pub(crate) fn proxy_path(proxy: &Path) -> Result<FilePath, Problem> {
-    let name = proxy
-        .file_name()
-        .map(|name| name.to_string_lossy().into_owned());
-    format!("proxy/{}", name.unwrap_or_default())
+    proxy_folder_path(Path::new(proxy.file_name().unwrap_or_default()))
+}
+
+fn proxy_folder_path(relative: &Path) -> Result<FilePath, Problem> {
+    format!("proxy/{}", relative.to_string_lossy())
         .parse()
-        .map_err(|error: ign_proto::IdError| Problem::usage(error.to_string()).at(proxy.display()))
+        .map_err(|error: ign_proto::IdError| {
+            Problem::usage(error.to_string()).at(relative.display())
+        })
+}
+
+/// The files that a glTF text names as its buffers, where they are there and beside it or below; nothing for any
+/// other file. What is missing is the preflight's to report.
+fn gltf_buffers(mesh: &Path) -> Vec<PathBuf> {
+    #[derive(serde::Deserialize)]
+    struct Document {
+        #[serde(default)]
+        buffers: Vec<Buffer>,
+    }
+    #[derive(serde::Deserialize)]
+    struct Buffer {
+        uri: Option<String>,
+    }
+    let is_gltf = mesh
+        .extension()
+        .is_some_and(|ending| ending.eq_ignore_ascii_case("gltf"));
+    if !is_gltf {
+        return Vec::new();
+    }
+    let document = std::fs::read(mesh)
+        .ok()
+        .and_then(|bytes| serde_json::from_slice::<Document>(&bytes).ok());
+    let beside = mesh.parent().unwrap_or(Path::new(""));
+    document
+        .into_iter()
+        .flat_map(|document| document.buffers)
+        .filter_map(|buffer| buffer.uri)
+        .filter(|uri| !uri.starts_with("data:"))
+        .map(|uri| {
+            let name = percent_encoding::percent_decode_str(&uri).decode_utf8_lossy();
+            PathBuf::from(name.into_owned())
+        })
+        .filter(|path| stays_inside(path))
+        .map(|path| beside.join(path))
+        .filter(|path| path.is_file())
+        .collect()
+}
+
+fn stays_inside(path: &Path) -> bool {
+    path.components().all(|part| {
+        matches!(
+            part,
+            std::path::Component::Normal(_) | std::path::Component::CurDir
+        )
+    })
 }
 
 /// Finds a proxy given on the command line: as it stands, or within the capture.
@@ -137,25 +186,40 @@ pub(crate) fn list(capture: &Path, proxy: Option<&Path>) -> Result<Vec<SourceFil
         let mesh = path.file_stem().is_some_and(|stem| stem == "mesh");
         if (mesh || FILES.iter().any(|file| name == *file)) && path.is_file() {
             files.push(source_file(capture, &path)?);
+            for buffer in gltf_buffers(&path) {
+                files.push(source_file(capture, &buffer)?);
+            }
         }
     }
     if let Some(named) = named_proxy {
         let path = capture.join(&named);
         if path.is_file() {
             files.push(source_file(capture, &path)?);
+            for buffer in gltf_buffers(&path) {
+                files.push(source_file(capture, &buffer)?);
+            }
         }
     }
     for path in ign_capture::camera_files(capture) {
         files.push(source_file(capture, &capture.join(path))?);
     }
     if let Some(proxy) = proxy {
-        files.push(SourceFile {
-            path: proxy_path(proxy)?,
-            source: Source::File(proxy.to_path_buf()),
-            size_bytes: std::fs::metadata(proxy)
-                .doing("cannot read the proxy", proxy.display())?
-                .len(),
-        });
+        let beside = proxy.parent().unwrap_or(Path::new(""));
+        let mut send = |path: FilePath, source: &Path| -> Result<(), Problem> {
+            files.push(SourceFile {
+                path,
+                source: Source::File(source.to_path_buf()),
+                size_bytes: std::fs::metadata(source)
+                    .doing("cannot read the proxy", source.display())?
+                    .len(),
+            });
+            Ok(())
+        };
+        send(proxy_path(proxy)?, proxy)?;
+        for buffer in gltf_buffers(proxy) {
+            let relative = buffer.strip_prefix(beside).unwrap_or(&buffer);
+            send(proxy_folder_path(relative)?, &buffer)?;
+        }
     }
     files.sort_by(|a, b| a.path.cmp(&b.path));
     files.dedup_by(|a, b| a.path == b.path);
@@ -202,15 +266,7 @@ fn source_file(capture: &Path, path: &Path) -> Result<SourceFile, Problem> {
 fn proxy_in_capture_toml(capture: &Path) -> Option<PathBuf> {
     let info = capture_toml(capture)?;
     let named = PathBuf::from(info.get("proxy")?.as_str()?);
-    named
-        .components()
-        .all(|part| {
-            matches!(
-                part,
-                std::path::Component::Normal(_) | std::path::Component::CurDir
-            )
-        })
-        .then_some(named)
+    stays_inside(&named).then_some(named)
 }
 
 /// `capture.toml` as a table; none when it is absent or broken.
@@ -300,7 +356,9 @@ fn media_type(path: &str) -> &'static str {
         "png" => "image/png",
         "webp" => "image/webp",
         "glb" => "model/gltf-binary",
+        "gltf" => "model/gltf+json",
         "obj" => "model/obj",
+        "stl" => "model/stl",
         "txt" => "text/plain",
         "toml" => "application/toml",
         "json" => "application/json",
@@ -425,6 +483,33 @@ mod tests {
                 "scan.csv",
                 "transforms.json"
             ]
+        );
+    }
+
+    #[test]
+    fn buffers_of_a_gltf_go_with_it_and_nothing_outside() {
+        let dir = capture();
+        let text = r#"{"buffers":[{"uri":"my%20mesh.bin"},{"uri":"data:;base64,AA=="},{"uri":"../secret"},{"uri":"none"}]}"#;
+        for folder in ["", "scan"] {
+            let folder = dir.path().join(folder);
+            std::fs::create_dir_all(&folder).unwrap();
+            std::fs::write(folder.join("mesh.gltf"), text).unwrap();
+            std::fs::write(folder.join("my mesh.bin"), "b").unwrap();
+        }
+        let files = list(dir.path(), Some(&dir.path().join("scan/mesh.gltf"))).unwrap();
+        let found = paths(&files);
+        for path in [
+            "mesh.gltf",
+            "my mesh.bin",
+            "proxy/mesh.gltf",
+            "proxy/my mesh.bin",
+        ] {
+            assert!(found.contains(&path), "{path}: {found:?}");
+        }
+        assert!(
+            !found
+                .iter()
+                .any(|path| path.contains("secret") || path.contains("none"))
         );
     }
 

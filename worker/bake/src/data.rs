@@ -10,6 +10,7 @@
 
 use ign_capture::{Background, Frame, ImportError, Scene, ViewImage};
 use ign_geometry::select::Candidates;
+use ign_geometry::simplify::simplify;
 use ign_geometry::{Camera, Drawable, Mesh, Similarity};
 use ign_nets::color;
 use ign_render::{CoverageRule, ReferenceImage, RenderSettings, Target};
@@ -31,9 +32,12 @@ const SELECTION_PX: u32 = 64;
 /// The scene in the normalised frame with its views split.
 pub(crate) struct Dataset<'a> {
     pub(crate) scene: &'a Scene,
+    /// The proxy, simplified where the views do not show the difference.
     pub(crate) mesh: Mesh,
     /// `mesh`, ready to be drawn.
     pub(crate) proxy: Drawable,
+    /// Where the proxy comes from and what became of it, in words for the plan.
+    pub(crate) proxy_words: String,
     pub(crate) normalisation: Similarity,
     pub(crate) frame: Frame,
     pub(crate) settings: RenderSettings,
@@ -117,10 +121,11 @@ impl<'a> Dataset<'a> {
             },
         };
         let mesh = scene.mesh.transformed(&normalisation);
-        Ok(Self {
+        let mut data = Self {
             scene,
             proxy: Drawable::new(&mesh),
             mesh,
+            proxy_words: String::new(),
             normalisation,
             frame,
             settings: render,
@@ -129,7 +134,44 @@ impl<'a> Dataset<'a> {
             validation,
             held_out: scene.held_out.clone(),
             device,
-        })
+        };
+        data.settle_proxy(settings.simplify);
+        Ok(data)
+    }
+
+    /// Simplifies the proxy as far as the training views allow, if `wanted`, and says so.
+    fn settle_proxy(&mut self, wanted: bool) {
+        let given = count(self.mesh.triangles.len());
+        let cameras: Vec<Camera> = self
+            .scene
+            .train
+            .iter()
+            .map(|&view| self.cameras(view, 1).0)
+            .collect();
+        let simplified = wanted.then(|| simplify(&self.mesh, &cameras)).flatten();
+        let words = match simplified {
+            Some(simplified) => {
+                let deviation = simplified.deviation;
+                self.mesh = simplified.mesh;
+                self.proxy = Drawable::new(&self.mesh);
+                format!(
+                    "Proxy of {given} triangles simplified to {}: depth within {:.2} px footprints and silhouette \
+                     within {:.3} px on average in {} views.",
+                    count(self.mesh.triangles.len()),
+                    deviation.depth_footprints,
+                    deviation.silhouette_px,
+                    simplified.views,
+                )
+            }
+            None if wanted => {
+                format!("Proxy of {given} triangles kept: a coarser one would show.")
+            }
+            None => format!("Proxy of {given} triangles, as given."),
+        };
+        self.proxy_words = match &self.scene.info.proxy_built {
+            Some(built) => format!("{words} It was built: {built}."),
+            None => words,
+        };
     }
 
     /// A view's camera in the normalised frame, and the world camera it comes from.
@@ -245,6 +287,19 @@ impl<'a> Dataset<'a> {
             })
             .collect()
     }
+}
+
+/// A number with its thousands set apart.
+fn count(number: usize) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (at, digit) in digits.chars().enumerate() {
+        if at > 0 && (digits.len() - at).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
 }
 
 fn byte(value: f32) -> u8 {

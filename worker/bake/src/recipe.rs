@@ -72,6 +72,10 @@ pub(crate) enum EffectsChoice {
 
 /// The recipe resolved: every number a bake needs.
 #[derive(Clone, Debug)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is a switch of the recipe"
+)]
 pub(crate) struct Settings {
     pub(crate) preset: Preset,
     pub(crate) k: usize,
@@ -90,6 +94,8 @@ pub(crate) struct Settings {
     pub(crate) half_weights: bool,
     pub(crate) checkpoint_secs: f64,
     pub(crate) margin: f64,
+    /// Whether the proxy may be simplified where no view shows the difference.
+    pub(crate) simplify: bool,
     /// Frames of the turntable preview.
     pub(crate) preview_frames: usize,
 }
@@ -137,6 +143,7 @@ impl Recipe {
             half_weights: false,
             checkpoint_secs: 20.0,
             margin: 0.05,
+            simplify: false,
             preview_frames: 36,
         };
         for (key, value) in &self.settings {
@@ -175,12 +182,13 @@ impl Settings {
             "half_weights" => self.half_weights = switch(key, value)?,
             "checkpoint_secs" => self.checkpoint_secs = number(key, value, 0.0, 86_400.0)?,
             "margin" => self.margin = number(key, value, 0.0, 2.0)?,
+            "simplify" => self.simplify = switch(key, value)?,
             "preview_frames" => self.preview_frames = number(key, value, 1, 360)?,
             _ => {
                 return Err(invalid(
                     format!("setting {key} is unknown"),
                     "known: k, references, supersample, effects, effects_steps, effects_batch, composition_steps, \
-                     batch, patch, ablate_effects, compare_paper, half_weights, checkpoint_secs, margin, preview_frames",
+                     batch, patch, ablate_effects, compare_paper, half_weights, checkpoint_secs, margin, simplify, preview_frames",
                 ));
             }
         }

@@ -73,13 +73,13 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
     let settings = job.recipe.resolve(scene.train.len())?;
     let data = Dataset::new(&scene, &job.recipe, &settings, device)?;
     reporter.info(format!(
-        "{} views to train on, {} to validate, {} held out; proxy of {} triangles; device {}",
+        "{} views to train on, {} to validate, {} held out; device {}",
         data.train.len(),
         data.validation.len(),
         data.held_out.len(),
-        data.mesh.triangles.len(),
         ign_nets::device::name(device),
     ));
+    reporter.info(data.proxy_words.clone());
     let checkpoints = job.work_dir.join("checkpoints");
     let mut session = Session::open(
         &reporter,
@@ -339,6 +339,7 @@ impl Bake<'_> {
             "effects_least_gain": EFFECTS_GAIN,
             "measured": session.measurements(),
             "words": [
+                data.proxy_words,
                 format!("{} reference views were chosen by coverage; each target view blends {} of them.", self.images.len(), settings.k),
                 words,
             ],
@@ -393,7 +394,10 @@ impl Bake<'_> {
             "preset": "paper",
             "references": self.images.len(),
             "k": self.settings.k,
-            "words": ["The paper's recipe as published; nothing was measured or left out."],
+            "words": [
+                self.data.proxy_words,
+                "The paper's networks, losses and schedule as published; nothing was measured or left out.",
+            ],
         });
         Ok(Trained {
             model,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::fault::{Faults, ImportError};
 use crate::photographs::{check_names, check_photographs, look_at_some, report_unregistered};
-use crate::proxy::{find_proxy, load_proxy};
+use crate::proxy::{Proxy, build_proxy, find_proxy, load_proxy};
 use crate::reconstruction::{self, Model};
 use crate::scene::{CaptureInfo, Point, Scene};
 use crate::settings;
@@ -30,9 +30,10 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     }
     let settings = settings::read(dir, &mut faults);
     let proxy = find_proxy(dir, options, &settings, &mut faults);
-    let mesh = proxy
-        .as_ref()
-        .and_then(|proxy| load_proxy(dir, proxy, &mut faults));
+    let mut mesh = match &proxy {
+        Proxy::File(path) => load_proxy(dir, path, &mut faults),
+        Proxy::Faulty | Proxy::None => None,
+    };
     let model = reconstruction::read(dir, &settings, &mut faults);
     let registered = check_names(&model, &mut faults);
     // Of a model that was read in part, what seems to be missing in it tells nothing.
@@ -41,6 +42,17 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
     if model_is_whole {
         report_unregistered(&dir.join("images"), &registered, &mut faults);
     }
+    let mut proxy_built = None;
+    if let Proxy::None = proxy
+        && let Some((built, words)) = build_proxy(&model, &candidates, &mut faults)
+    {
+        mesh = Some(built);
+        proxy_built = Some(words);
+    }
+    let proxy = match proxy {
+        Proxy::File(path) => Some(path),
+        Proxy::Faulty | Proxy::None => None,
+    };
     let held_out_names = held_out_names(dir, &settings, &registered, model_is_whole, &mut faults);
     // Counting views makes sense only when none of them is missing for another reason.
     let views_are_complete = !faults.has_errors();
@@ -86,7 +98,8 @@ pub fn import(dir: &Path, options: &ImportOptions) -> Result<Scene, ImportError>
             licence: settings.licence,
             rights: settings.rights,
             metres_per_scene_unit: settings.metres_per_scene_unit,
-            proxy: proxy.unwrap_or_default(),
+            proxy,
+            proxy_built,
         },
         mesh,
         views,

@@ -48,8 +48,10 @@ pub struct CaptureInfo {
     pub rights: Option<String>,
     /// Metres per unit of the world frame, where known.
     pub metres_per_scene_unit: Option<f64>,
-    /// The proxy's path inside the capture.
-    pub proxy: PathBuf,
+    /// The proxy's path inside the capture; none where it was built from the points.
+    pub proxy: Option<PathBuf>,
+    /// How the proxy was built, where the capture has none: words for people.
+    pub proxy_built: Option<String>,
 }
 
 /// One photograph and its camera.

@@ -1,8 +1,9 @@
 //! Triangle meshes: the proxy geometry.
 //!
 //! Invariants of a mesh made by [`Mesh::new`] or [`crate::read_mesh`]: positions finite, indices in range, at least
-//! one triangle, none degenerate, one unit normal per vertex.
+//! one triangle, none degenerate, none twice, one unit normal per vertex.
 
+use std::collections::HashSet;
 use std::path::PathBuf;
 
 use glam::DVec3;
@@ -42,8 +43,8 @@ pub enum MeshError {
         /// What is wrong there.
         reason: String,
     },
-    /// Neither PLY nor OBJ by name and content.
-    #[error("mesh {path} is neither PLY nor OBJ")]
+    /// None of our formats by content and name.
+    #[error("mesh {path} is no PLY, OBJ, STL, GLB or glTF")]
     UnknownFormat {
         /// The file.
         path: PathBuf,
@@ -82,7 +83,7 @@ pub enum MeshError {
         coordinate: f64,
     },
     /// No triangle with an area.
-    #[error("no triangle with an area is left of {triangles}")]
+    #[error("{}", no_triangles(*triangles))]
     NoTriangles {
         /// Number of triangles before degenerate ones were dropped.
         triangles: usize,
@@ -93,6 +94,13 @@ pub enum MeshError {
         /// Number of triangles or vertices.
         count: usize,
     },
+}
+
+fn no_triangles(triangles: usize) -> String {
+    match triangles {
+        0 => "it holds points but no triangles".into(),
+        _ => format!("no triangle with an area is left of {triangles}"),
+    }
 }
 
 /// A triangle mesh with one normal per vertex.
@@ -109,8 +117,9 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// A mesh from positions and triangles. Degenerate triangles (repeated vertex, no area) are dropped; normals are
-    /// the area-weighted mean of the adjacent faces' normals, whichever way round these are wound.
+    /// A mesh from positions and triangles. Degenerate triangles (repeated vertex, no area) are dropped, and so are all
+    /// but the first of triangles with the same corners, whichever way they turn; normals are the area-weighted mean
+    /// of the adjacent faces' normals, whichever way round these are wound.
     ///
     /// # Errors
     /// [`MeshError`] for coordinates that are not finite or beyond 1e100, indices out of range, or no triangle left.
@@ -143,7 +152,8 @@ impl Mesh {
         }
         let count = triangles.len();
         let mut kept = triangles;
-        kept.retain(|&corners| face_vector(&positions, corners).length_squared() > 0.0);
+        kept.retain(|&corners| face_vector(&positions, corners).abs().max_element() > 0.0);
+        drop_repeated(&mut kept);
         if kept.is_empty() {
             return Err(MeshError::NoTriangles { triangles: count });
         }
@@ -276,6 +286,17 @@ fn vertex_normals(positions: &[DVec3], triangles: &[[u32; 3]]) -> Vec<DVec3> {
         .collect()
 }
 
+/// Drops triangles whose three corners an earlier one has: drawn they would change nothing, but they would count
+/// twice for the normals, or cancel them where they turn the other way.
+fn drop_repeated(triangles: &mut Vec<[u32; 3]>) {
+    let mut seen = HashSet::with_capacity(triangles.len());
+    triangles.retain(|corners| {
+        let mut corners = *corners;
+        corners.sort_unstable();
+        seen.insert(corners)
+    });
+}
+
 /// Normal of a triangle, as long as twice its area.
 fn face_vector(positions: &[DVec3], corners: [u32; 3]) -> DVec3 {
     let [a, b, c] = corners.map(|corner| positions[corner as usize]);
@@ -340,6 +361,22 @@ mod tests {
         assert!(matches!(
             Mesh::new(Vec::new(), Vec::new()),
             Err(MeshError::NoTriangles { triangles: 0 })
+        ));
+    }
+
+    #[test]
+    fn repeated_triangles_change_nothing_and_far_vertices_are_named() {
+        let (positions, triangles) = tetrahedron();
+        let once = Mesh::new(positions.clone(), triangles.clone()).expect("valid");
+        let mut doubled = triangles.clone();
+        doubled.extend(triangles.iter().map(|&[a, b, c]| [c, b, a]));
+        doubled.extend(triangles.iter().map(|&[a, b, c]| [b, c, a]));
+        assert_eq!(Mesh::new(positions.clone(), doubled).expect("valid"), once);
+        let mut far = positions;
+        far[3].z = -1e101;
+        assert!(matches!(
+            Mesh::new(far, triangles),
+            Err(MeshError::TooFar { vertex: 3, .. })
         ));
     }
 

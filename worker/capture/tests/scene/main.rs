@@ -6,3 +6,4 @@ mod hard;
 mod loading;
 mod photographs;
 mod preflight;
+mod proxy;

@@ -101,7 +101,7 @@ fn missing_parts_are_one_fault_each() {
     fs::write(empty.path().join("readme.txt"), "x").expect("a file");
     let found = faults(empty.path(), &ImportOptions::default());
     let places: Vec<&str> = errors(&found).iter().map(|error| error.0).collect();
-    assert_eq!(places, ["mesh.ply", "sparse/", "images/"]);
+    assert_eq!(places, ["sparse/", "images/", "mesh.ply"]);
 
     for (part, at) in [
         ("images", "images/"),
@@ -156,7 +156,7 @@ fn proxies_are_found_by_option_settings_and_name() {
         };
         let scene = import(capture.dir(), &options).expect("a sound capture");
         (
-            scene.info.proxy.display().to_string(),
+            scene.info.proxy.expect("a file").display().to_string(),
             scene.mesh.bounding_sphere().1 < 0.3,
         )
     };

@@ -1,10 +1,15 @@
-//! Readers of mesh files.
+//! Readers of mesh files: PLY, OBJ, STL, GLB and glTF, recognised by what they hold.
+//!
+//! Every reader takes bytes that nobody vouches for: counts and offsets in them are checked against what is really
+//! there before anything is allocated, and no file that a mesh names is opened outside the mesh's own folder.
 
+mod gltf;
 mod obj;
 mod ply;
 mod points;
+mod stl;
 
-use std::path::Path;
+use std::path::{Component, Path};
 
 use glam::DVec3;
 
@@ -36,45 +41,113 @@ impl Fault {
     }
 }
 
-/// Reads a mesh: PLY (ascii or binary of either byte order) or OBJ.
+/// Opens a file that a mesh refers to, by its path relative to the mesh's folder.
+pub type OpenBeside<'a> = dyn Fn(&Path) -> std::io::Result<Vec<u8>> + 'a;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Format {
+    Ply,
+    Obj,
+    Stl,
+    Glb,
+    Gltf,
+}
+
+/// Bytes at the start of a file that are looked at to tell a text format.
+const SNIFFED_BYTES: usize = 1 << 16;
+
+impl Format {
+    /// By content; by the name's ending where the content is none of ours, so that the reader can say what it misses.
+    fn of(name: &Path, bytes: &[u8]) -> Option<Self> {
+        Self::by_content(bytes).or_else(|| {
+            let ending = name.extension()?.to_str()?.to_ascii_lowercase();
+            Some(match ending.as_str() {
+                "ply" => Self::Ply,
+                "obj" => Self::Obj,
+                "stl" => Self::Stl,
+                "glb" => Self::Glb,
+                "gltf" => Self::Gltf,
+                _ => return None,
+            })
+        })
+    }
+
+    fn by_content(bytes: &[u8]) -> Option<Self> {
+        if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
+            return Some(Self::Ply);
+        }
+        if bytes.starts_with(b"glTF") {
+            return Some(Self::Glb);
+        }
+        // Before ASCII: the header of a binary STL may start with "solid", or with anything else.
+        if stl::is_binary(bytes) {
+            return Some(Self::Stl);
+        }
+        let text = String::from_utf8_lossy(&bytes[..bytes.len().min(SNIFFED_BYTES)]);
+        let text = text.trim_start_matches('\u{feff}').trim_start();
+        if text.starts_with('{') {
+            return Some(Self::Gltf);
+        }
+        if text.starts_with("solid") && (text.contains("facet") || text.contains("endsolid")) {
+            return Some(Self::Stl);
+        }
+        let first_word = text
+            .lines()
+            .filter_map(|line| line.split_whitespace().next())
+            .find(|word| !word.starts_with('#'))?;
+        obj::KEYWORDS.contains(&first_word).then_some(Self::Obj)
+    }
+}
+
+/// Reads a mesh file: PLY, OBJ, STL, GLB or glTF.
 ///
-/// The format is recognised by content (`ply` in the first line) and otherwise by the ending `.obj`. Faces with more
-/// than three corners become triangle fans. Normals are the file's where it has usable ones, otherwise area-weighted.
+/// The format is recognised by content, whatever the file is called. Faces with more than three corners become
+/// triangle fans. Normals are the file's where it has usable ones, otherwise area-weighted. Files that a glTF names
+/// are looked for in its own folder and below.
 ///
 /// # Errors
-/// [`MeshError`] names the file, and the line, byte or vertex.
+/// [`MeshError`] names the file, and the line, byte, vertex, triangle or accessor.
 pub fn read_mesh(path: &Path) -> Result<Mesh, MeshError> {
     let bytes = std::fs::read(path).map_err(|source| MeshError::Io {
         path: path.to_owned(),
         source,
     })?;
-    let soup = if bytes.starts_with(b"ply") {
-        ply::parse(&bytes)
-    } else if path
-        .extension()
-        .is_some_and(|ending| ending.eq_ignore_ascii_case("obj"))
-    {
-        obj::parse(&bytes)
-    } else if path
-        .extension()
-        .is_some_and(|ending| ending.eq_ignore_ascii_case("ply"))
-    {
-        Err(Fault::new("line 1", "expected \"ply\""))
-    } else {
-        return Err(MeshError::UnknownFormat {
-            path: path.to_owned(),
-        });
+    let folder = path.parent().unwrap_or(Path::new(""));
+    parse_mesh(path, &bytes, &|beside| std::fs::read(folder.join(beside)))
+}
+
+/// Parses the bytes of a mesh file; `name` is what errors call it. `open_beside` is asked for files that a glTF names,
+/// always with a relative path that does not lead upwards.
+///
+/// Memory grows with the bytes that are there, not with the counts they claim.
+///
+/// # Errors
+/// As [`read_mesh`].
+pub fn parse_mesh(
+    name: &Path,
+    bytes: &[u8],
+    open_beside: &OpenBeside<'_>,
+) -> Result<Mesh, MeshError> {
+    let format = Format::of(name, bytes).ok_or_else(|| MeshError::UnknownFormat {
+        path: name.to_owned(),
+    })?;
+    let soup = match format {
+        Format::Ply => ply::parse(bytes),
+        Format::Obj => obj::parse(bytes),
+        Format::Stl => stl::parse(bytes),
+        Format::Glb => gltf::parse_binary(bytes, open_beside),
+        Format::Gltf => gltf::parse_text(bytes, open_beside),
     };
     let soup = soup.map_err(|Fault { at, reason }| MeshError::Malformed {
-        path: path.to_owned(),
+        path: name.to_owned(),
         at,
         reason,
     })?;
-    let unusable = |source| MeshError::Unusable {
-        path: path.to_owned(),
-        source: Box::new(source),
-    };
-    let mut mesh = Mesh::new(soup.positions, soup.triangles).map_err(unusable)?;
+    let mut mesh =
+        Mesh::new(soup.positions, soup.triangles).map_err(|source| MeshError::Unusable {
+            path: name.to_owned(),
+            source: Box::new(source),
+        })?;
     if let Some(normals) = &soup.normals {
         mesh.adopt_normals(normals);
     }
@@ -82,6 +155,27 @@ pub fn read_mesh(path: &Path) -> Result<Mesh, MeshError> {
         .colors
         .filter(|colors| colors.len() == mesh.positions.len());
     Ok(mesh)
+}
+
+/// Colours stored as real numbers, as bytes: in [0, 1] by the formats' documents, in [0, 255] in some files.
+fn bytes_from_real_colors(colors: &[[f32; 3]]) -> Vec<[u8; 3]> {
+    let scale = if colors.iter().flatten().any(|channel| *channel > 1.0) {
+        1.0
+    } else {
+        255.0
+    };
+    colors
+        .iter()
+        .map(|color| color.map(|channel| (channel * scale).round() as u8))
+        .collect()
+}
+
+/// A path that stays in the folder it is relative to.
+fn stays_inside(path: &Path) -> bool {
+    path.components().next().is_some()
+        && path
+            .components()
+            .all(|part| matches!(part, Component::Normal(_) | Component::CurDir))
 }
 
 #[cfg(test)]
@@ -254,8 +348,9 @@ mod tests {
             "{text}"
         );
         let text = fails("mesh.obj", b"");
-        assert!(text.contains("no triangle with an area"), "{text}");
-        assert!(fails("mesh.stl", b"solid").contains("neither PLY nor OBJ"));
+        assert!(text.contains("points but no triangles"), "{text}");
+        assert!(fails("mesh.fbx", b"Kaydara").contains("no PLY, OBJ, STL, GLB or glTF"));
+        assert!(fails("mesh.stl", b"nothing").contains("too short for a binary STL"));
         assert!(matches!(
             read_mesh(Path::new("/nowhere/mesh.ply")),
             Err(MeshError::Io { .. })
@@ -264,11 +359,15 @@ mod tests {
 
     proptest! {
         #[test]
-        fn damaged_files_never_panic(place in 0_usize..400, byte in any::<u8>(), kind in 0..3, cut in 0_usize..500) {
+        fn damaged_files_never_panic(place in 0_usize..8000, byte in any::<u8>(), kind in 0..7, cut in 0_usize..500) {
             let (name, mut bytes) = match kind {
                 0 => ("a.ply", ASCII.as_bytes().to_vec()),
                 1 => ("b.ply", binary(false)),
-                _ => ("c.obj", b"v 0 0 0\nv 1 0 0\nvn 0 0 1\nv 0 1 0\nf 1//1 2//1 3//1\n".to_vec()),
+                2 => ("c.obj", b"v 0 0 0\nv 1 0 0\nvn 0 0 1\nv 0 1 0\nf 1//1 2//1 3//1\n".to_vec()),
+                3 => ("d.stl", include_bytes!("../../tests/reference/meshes/trimesh_ascii.stl").to_vec()),
+                4 => ("e.stl", include_bytes!("../../tests/reference/meshes/open3d.stl").to_vec()),
+                5 => ("f.glb", include_bytes!("../../tests/reference/meshes/pygltflib.glb").to_vec()),
+                _ => ("g.gltf", include_bytes!("../../tests/reference/meshes/pygltflib.gltf").to_vec()),
             };
             let length = bytes.len();
             bytes[place % length] = byte;

@@ -1,12 +1,12 @@
 //! PLY: the Stanford polygon format (Turk 1994), ascii and binary of either byte order.
 //!
-//! Read: element `vertex` with `x y z`, optionally `nx ny nz` and `red green blue`; element `face` with the list
-//! `vertex_indices` or `vertex_index`. Everything else is skipped. Counts in the header are not trusted: memory
-//! grows with the data that is really there.
+//! Read: element `vertex` with `x y z`, optionally `nx ny nz` and `red green blue` (also as `diffuse_red` or `r`, of any
+//! scalar type); element `face` with the list `vertex_indices` or `vertex_index`. Everything else is skipped. Counts in
+//! the header are not trusted: memory grows with the data that is really there.
 
 use glam::DVec3;
 
-use super::{Fault, Soup};
+use super::{Fault, Soup, bytes_from_real_colors};
 
 /// Scalar types, under both their old and new names.
 #[derive(Clone, Copy)]
@@ -36,12 +36,12 @@ impl Scalar {
         })
     }
 
-    /// Factor that takes a stored colour to 0..=255.
+    /// Factor that takes a stored colour to [0, 1].
     fn color_scale(self) -> f64 {
         match self {
-            Self::U16 => 255.0 / 65535.0,
-            Self::F32 | Self::F64 => 255.0,
-            Self::I8 | Self::U8 | Self::I16 | Self::I32 | Self::U32 => 1.0,
+            Self::U16 => 1.0 / 65535.0,
+            Self::F32 | Self::F64 => 1.0,
+            Self::I8 | Self::U8 | Self::I16 | Self::I32 | Self::U32 => 1.0 / 255.0,
         }
     }
 }
@@ -103,6 +103,9 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Fault> {
 
 /// Encoding, elements, where the data starts, and how many lines the header has.
 fn header(bytes: &[u8]) -> Result<(Encoding, Vec<Element>, usize, usize), Fault> {
+    if !bytes.starts_with(b"ply") {
+        return Err(Fault::new("line 1", "expected \"ply\""));
+    }
     let mut encoding = None;
     let mut elements: Vec<Element> = Vec::new();
     let mut at = 0;
@@ -257,10 +260,27 @@ impl<const BIG: bool> Numbers for Binary<'_, BIG> {
     fn next_entry(&mut self) {}
 }
 
-/// What a property of a vertex means to us: which of the nine numbers it is.
-const VERTEX_NAMES: [&str; 9] = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"];
+/// What a property of a vertex means to us: which of the nine numbers it is, under any of its names.
+const VERTEX_NAMES: [&[&str]; 9] = [
+    &["x"],
+    &["y"],
+    &["z"],
+    &["nx"],
+    &["ny"],
+    &["nz"],
+    &["red", "diffuse_red", "r"],
+    &["green", "diffuse_green", "g"],
+    &["blue", "diffuse_blue", "b"],
+];
 
 fn body(numbers: &mut impl Numbers, elements: &[Element], soup: &mut Soup) -> Result<(), Fault> {
+    let has = |name: &str| elements.iter().any(|element| element.name == name);
+    if has("tristrips") && !has("face") {
+        return Err(Fault::new(
+            "header",
+            "the file holds triangle strips; export it again with faces",
+        ));
+    }
     for element in elements {
         match element.name.as_str() {
             "vertex" => vertices(numbers, element, soup)?,
@@ -305,7 +325,7 @@ fn vertices(numbers: &mut impl Numbers, element: &Element, soup: &mut Soup) -> R
         .map(|property| {
             VERTEX_NAMES
                 .iter()
-                .position(|name| *name == property.name && property.count.is_none())
+                .position(|names| names.contains(&&property.name[..]) && property.count.is_none())
         })
         .collect();
     let has =
@@ -314,7 +334,7 @@ fn vertices(numbers: &mut impl Numbers, element: &Element, soup: &mut Soup) -> R
         return Err(Fault::new("header", "element vertex has no x, y, z"));
     }
     let mut normals = has(3..6).then(Vec::new);
-    let mut colors = has(6..9).then(Vec::new);
+    let mut colors: Option<Vec<[f32; 3]>> = has(6..9).then(Vec::new);
     for vertex in 0..element.count {
         numbers.next_entry();
         let mut values = [0.0; VERTEX_NAMES.len()];
@@ -342,11 +362,11 @@ fn vertices(numbers: &mut impl Numbers, element: &Element, soup: &mut Soup) -> R
             normals.push(DVec3::new(nx, ny, nz));
         }
         if let Some(colors) = &mut colors {
-            colors.push([red, green, blue].map(|channel| channel.round() as u8));
+            colors.push([red, green, blue].map(|channel| channel as f32));
         }
     }
     soup.normals = normals;
-    soup.colors = colors;
+    soup.colors = colors.map(|colors| bytes_from_real_colors(&colors));
     Ok(())
 }
 
