@@ -30,11 +30,11 @@ async fn to_its_end<T: Send + 'static>(
         .map_err(|error| Refused(crate::error::internal(&error)))?
 }
 
-fn to_tally(tally: Tally) -> Option<v1::Tally> {
-    Some(v1::Tally {
+fn to_tally(tally: Tally) -> v1::Tally {
+    v1::Tally {
         objects: tally.objects,
         bytes: tally.bytes,
-    })
+    }
 }
 
 #[tonic::async_trait]
@@ -71,12 +71,12 @@ impl Admin for AdminApi {
         let collected =
             to_its_end(async move { app.collect(grace, request.dry_run).await }).await?;
         Ok(Response::new(v1::CollectGarbageResponse {
-            named: to_tally(collected.named),
-            young: to_tally(collected.young),
-            trashed: to_tally(collected.trashed),
-            waiting: to_tally(collected.waiting),
-            rescued: to_tally(collected.rescued),
-            deleted: to_tally(collected.deleted),
+            named: Some(to_tally(collected.named)),
+            young: Some(to_tally(collected.young)),
+            trashed: Some(to_tally(collected.trashed)),
+            waiting: Some(to_tally(collected.waiting)),
+            rescued: Some(to_tally(collected.rescued)),
+            deleted: Some(to_tally(collected.deleted)),
         }))
     }
 
@@ -87,7 +87,7 @@ impl Admin for AdminApi {
         let app = self.0.clone();
         let audit = to_its_end(async move { app.audit(None).await }).await?;
         Ok(Response::new(v1::AuditRegistryResponse {
-            read: to_tally(audit.read),
+            read: Some(to_tally(audit.read)),
             faults: audit
                 .faults
                 .into_iter()
