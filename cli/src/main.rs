@@ -25,7 +25,8 @@ use std::process::ExitCode;
 use clap::{CommandFactory as _, Parser};
 
 use crate::commands::{
-    admin, bake, bundle, collections, completions, doctor, jobs, status, submit, token, up,
+    admin, bake, bundle, collections, completions, doctor, jobs, preflight, status, submit, token,
+    up,
 };
 use crate::connection::ConnectionArgs;
 use crate::output::Format;
@@ -62,6 +63,8 @@ enum Command {
     Up(up::Args),
     /// Bake one capture: submit, wait, fetch the bundle and its report
     Bake(bake::Args),
+    /// Report on captures before anything is queued: coverage, blur, exposure, light, cost
+    Preflight(preflight::Args),
     /// Queue captures: one, a folder of them, or a CSV list
     Submit(submit::Args),
     /// Show the queue, the workers, running jobs and failures on one screen
@@ -147,6 +150,7 @@ async fn run(cli: Cli) -> Result<(), Problem> {
     match cli.command {
         Command::Up(args) => up::run(&context, &args).await,
         Command::Bake(args) => bake::run(&context, &args).await,
+        Command::Preflight(args) => preflight::run(&context, &args).await,
         Command::Submit(args) => submit::run(&context, &args).await,
         Command::Status(args) => status::run(&context, &args).await,
         Command::Jobs(command) => jobs::run(&context, &command).await,

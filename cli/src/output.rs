@@ -93,6 +93,9 @@ pub(crate) fn stdout_is_terminal() -> bool {
     std::io::stdout().is_terminal()
 }
 
+/// Columns of running text where stdout is no terminal.
+const WRAP_COLUMNS: usize = 100;
+
 /// Columns to fit tables into; none when stdout is no terminal.
 fn width() -> Option<usize> {
     stdout_is_terminal().then(|| usize::from(Term::stdout().size().1).max(40))
@@ -221,6 +224,30 @@ pub(crate) fn printable(text: &str) -> String {
             c => c,
         })
         .collect()
+}
+
+/// `text` behind `label`, broken between words to the terminal's width and aligned behind the label.
+pub(crate) fn wrapped(label: &str, text: &str) -> String {
+    wrap(label, &printable(text), width().unwrap_or(WRAP_COLUMNS))
+}
+
+fn wrap(label: &str, text: &str, columns: usize) -> String {
+    let indent = measure_text_width(label);
+    let mut lines = vec![label.to_string()];
+    for word in text.split(' ') {
+        let line = lines.last().map_or("", String::as_str);
+        let used = measure_text_width(line);
+        if used > indent && used + 1 + measure_text_width(word) > columns {
+            lines.push(" ".repeat(indent));
+        }
+        if let Some(line) = lines.last_mut() {
+            if measure_text_width(line) > indent {
+                line.push(' ');
+            }
+            line.push_str(word);
+        }
+    }
+    lines.join("\n") + "\n"
 }
 
 /// Name and value, one pair a line, values aligned; empty values are left out.
@@ -432,6 +459,14 @@ mod tests {
         0a1b      4.9  a b?[31mred
         0a1b2c3d  121  mesh missing
         ");
+    }
+
+    #[test]
+    fn text_is_broken_between_words() {
+        assert_eq!(
+            wrap("at: ", "one two three fourteen", 11),
+            "at: one two\n    three\n    fourteen\n"
+        );
     }
 
     #[test]

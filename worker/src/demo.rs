@@ -29,6 +29,9 @@ pub(crate) struct Options {
     /// Varies painting and camera path.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Turn the object under fixed lamps instead of moving the camera: light that is not constant.
+    #[arg(long)]
+    turntable: bool,
 }
 
 pub(crate) fn run(options: &Options) -> Result<()> {
@@ -39,6 +42,7 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         views: options.views,
         held_out: options.held_out,
         seed: options.seed,
+        turntable: options.turntable,
     };
     let steps = std::cell::RefCell::new(Steps::new("views traced", options.views as u64));
     let summary = ign_demo::generate(&options.out, &demo, &|done, _total| {

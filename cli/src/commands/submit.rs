@@ -7,17 +7,17 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use chrono::{DateTime, Utc};
-use ign_capture::{Fault, ImportError, ImportOptions, Severity};
+use ign_capture::{Fault, Findings, PreflightOptions, Severity};
 use ign_proto::{CollectionId, ObjectName, v1};
 use serde::Serialize;
 
 use crate::Context;
 use crate::bag;
-use crate::commands::{jobs, manifest};
+use crate::commands::{jobs, manifest, preflight};
 use crate::connection::Connection;
 use crate::output::{self, Table};
 use crate::pack;
-use crate::problem::{Doing as _, Exit, Problem, chain};
+use crate::problem::{Doing as _, Exit, Problem};
 use crate::recipe::{RecipeArgs, key_value};
 use crate::upload::{self, Order};
 use crate::views::{JobView, ShortIds, short_id, time};
@@ -87,6 +87,7 @@ struct CheckView {
     held_out_views: Option<usize>,
     triangles: Option<usize>,
     faults: Vec<Fault>,
+    findings: Option<Findings>,
 }
 
 pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
@@ -244,7 +245,7 @@ fn plan_paths(args: &Args) -> Planned {
 }
 
 /// The folder itself when it looks like a capture, otherwise its children that do; of a bag, those of its payload.
-fn captures_in(path: &Path) -> Result<Vec<PathBuf>, Problem> {
+pub(crate) fn captures_in(path: &Path) -> Result<Vec<PathBuf>, Problem> {
     pack::check_folder(path)?;
     let path = &bag::payload(path)?;
     if pack::looks_like_capture(path) {
@@ -494,9 +495,7 @@ async fn dry_run(
             index + 1,
             order.capture.display()
         ));
-        let check = tokio::task::spawn_blocking(move || check(&order))
-            .await
-            .map_err(|error| Problem::failed(format!("the check stopped: {error}")))?;
+        let check = check(order).await?;
         errors.check(&check)?;
         checks.push(check);
     }
@@ -510,34 +509,24 @@ async fn dry_run(
     Ok(())
 }
 
-fn check(order: &Order) -> CheckView {
-    let mut view = CheckView {
-        path: order.capture.clone(),
+async fn check(order: Order) -> Result<CheckView, Problem> {
+    let options = PreflightOptions {
+        proxy: None,
+        size: order.recipe.size,
+    };
+    let report = preflight::examine(order.capture.clone(), options).await?;
+    let counts = report.findings.as_ref().map(|findings| &findings.counts);
+    Ok(CheckView {
+        path: order.capture,
         collection: order.object.collection.to_string(),
         object: order.object.object.to_string(),
-        ok: false,
-        train_views: None,
-        held_out_views: None,
-        triangles: None,
-        faults: Vec::new(),
-    };
-    match ign_capture::import(&order.capture, &ImportOptions::default()) {
-        Ok(scene) => {
-            view.ok = true;
-            view.train_views = Some(scene.train.len());
-            view.held_out_views = Some(scene.held_out.len());
-            view.triangles = Some(scene.mesh.triangles.len());
-            view.faults = scene.warnings;
-        }
-        Err(ImportError::Faults(faults)) => view.faults = faults,
-        Err(error) => view.faults.push(Fault {
-            severity: Severity::Error,
-            message: chain(&error),
-            at: String::new(),
-            hint: String::new(),
-        }),
-    }
-    view
+        ok: report.ok,
+        train_views: counts.map(|counts| counts.train),
+        held_out_views: counts.map(|counts| counts.held_out),
+        triangles: counts.map(|counts| counts.triangles),
+        faults: report.faults,
+        findings: report.findings,
+    })
 }
 
 fn check_table(checks: &[CheckView]) -> String {
@@ -578,25 +567,8 @@ fn check_table(checks: &[CheckView]) -> String {
 }
 
 fn fault_list(check: &CheckView) -> String {
-    let lines = check.faults.iter().flat_map(|fault| {
-        let label = match fault.severity {
-            Severity::Error => "error",
-            Severity::Warning => "warning",
-        };
-        [
-            (label, &fault.message),
-            ("at", &fault.at),
-            ("hint", &fault.hint),
-        ]
-        .into_iter()
-        .filter(|(_, line)| !line.is_empty())
-        .map(|(label, line)| format!("  {label:>7}: {}", output::printable(line)))
-    });
     let capture = output::printable(&check.path.display().to_string());
-    let lines: Vec<String> = std::iter::once(format!("\n{capture}"))
-        .chain(lines)
-        .collect();
-    lines.join("\n") + "\n"
+    format!("\n{capture}\n{}", preflight::faults(&check.faults))
 }
 
 #[cfg(test)]
@@ -684,6 +656,7 @@ mod tests {
             held_out_views: ok.then_some(24),
             triangles: ok.then_some(5000),
             faults,
+            findings: None,
         };
         insta::assert_snapshot!(check_table(&[
             check(true, vec![]),

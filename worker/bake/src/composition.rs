@@ -118,7 +118,7 @@ fn examples(
         let cut = |t: &Tensor| t.narrow(2, y, h).narrow(3, x, w).to_kind(Kind::Half);
         examples.push(Example {
             input: with_kind(&input.crop(y, x, h, w), Kind::Half),
-            truth: cut(&scored.truth),
+            truth: cut(&scored.canonical_truth()),
             coverage: cut(&coverage),
             size: (h, w),
         });
@@ -303,7 +303,7 @@ pub(crate) fn train_paper(
         let scored = data.scored(view)?;
         examples.push((
             model.paper_input(&scored.target).to_kind(Kind::Half),
-            scored.truth.to_kind(Kind::Half),
+            scored.canonical_truth().to_kind(Kind::Half),
             (&scored.target.coverage * &scored.counted).to_kind(Kind::Half),
         ));
     }

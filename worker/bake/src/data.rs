@@ -7,8 +7,12 @@
 //!
 //! What the capture says to ignore (a hand, a stand) counts as lying outside the photograph: it has no weight as a
 //! colour to learn from or to show, is black in both images that are compared, and is no part of the object's score.
+//!
+//! Exposure. Where the photographs differ in exposure, everything that is learned from and rendered is in one canonical
+//! exposure: photographs are multiplied by their view's gain, in linear light. Scores compare with the photographs as
+//! they are, so a rendering is divided by the view's gain first ([`Scored::photographed`]), every method's alike.
 
-use ign_capture::{Background, Frame, ImportError, Scene, ViewImage};
+use ign_capture::{Background, Frame, Gains, ImportError, Scene, ViewImage};
 use ign_geometry::select::Candidates;
 use ign_geometry::simplify::simplify;
 use ign_geometry::{Camera, Drawable, Mesh, Similarity};
@@ -46,14 +50,18 @@ pub(crate) struct Dataset<'a> {
     pub(crate) train: Vec<usize>,
     pub(crate) validation: Vec<usize>,
     pub(crate) held_out: Vec<usize>,
+    /// Per view of the scene and channel, linear light: from the photograph to the canonical exposure.
+    pub(crate) gains: Vec<[f32; 3]>,
     pub(crate) device: Device,
 }
 
 /// One view as it is scored.
 pub(crate) struct Scored {
     pub(crate) target: Target,
-    /// [1, 3, H, W]: encoded sRGB, black outside the object.
+    /// [1, 3, H, W]: encoded sRGB, black outside the object, in the photograph's exposure.
     pub(crate) truth: Tensor,
+    /// Per channel, linear light: from the photograph's exposure to the canonical one.
+    pub(crate) gain: [f32; 3],
     /// [1, 1, H, W]: 0 where both images are black before scoring, else 1.
     pub(crate) counted: Tensor,
     /// Row-major: on the object.
@@ -62,10 +70,37 @@ pub(crate) struct Scored {
     pub(crate) object_mask: Tensor,
 }
 
+impl Scored {
+    /// `image` ([1, 3, H, W], encoded sRGB, canonical exposure) as the photograph would show it.
+    pub(crate) fn photographed(&self, image: &Tensor) -> Tensor {
+        multiplied(image, self.gain.map(|gain| 1.0 / gain))
+    }
+
+    /// [1, 3, H, W]: the photograph in the canonical exposure, encoded sRGB; what networks are trained towards.
+    pub(crate) fn canonical_truth(&self) -> Tensor {
+        multiplied(&self.truth, self.gain)
+    }
+}
+
+/// Multiplies encoded colours [1, 3, H, W] by a factor per channel in linear light; the result lies in [0, 1].
+fn multiplied(image: &Tensor, factors: [f32; 3]) -> Tensor {
+    if factors == NO_GAIN {
+        return image.shallow_clone();
+    }
+    let factors = Tensor::from_slice(&factors)
+        .view([1, 3, 1, 1])
+        .to_device(image.device());
+    let light = color::linear_from_srgb(&image.clamp(0.0, 1.0)) * factors;
+    color::srgb_from_linear(&light.clamp(0.0, 1.0))
+}
+
+/// The gain of a view whose photograph stays as it is.
+const NO_GAIN: [f32; 3] = [1.0; 3];
+
 /// A view's straight colours and weights at one camera.
 pub(crate) struct Straight {
     pub(crate) camera: Camera,
-    /// Row-major RGB, encoded sRGB in [0, 1].
+    /// Row-major RGB, encoded sRGB in [0, 1], canonical exposure.
     pub(crate) rgb: Vec<f32>,
     /// Row-major weight in [0, 1].
     pub(crate) alpha: Vec<f32>,
@@ -74,6 +109,7 @@ pub(crate) struct Straight {
 impl<'a> Dataset<'a> {
     pub(crate) fn new(
         scene: &'a Scene,
+        gains: &Gains,
         recipe: &Recipe,
         settings: &Settings,
         device: Device,
@@ -133,6 +169,11 @@ impl<'a> Dataset<'a> {
             train,
             validation,
             held_out: scene.held_out.clone(),
+            gains: gains
+                .per_view
+                .iter()
+                .map(|gain| gain.map(|channel| channel as f32))
+                .collect(),
             device,
         };
         data.settle_proxy(settings.simplify);
@@ -215,6 +256,7 @@ impl<'a> Dataset<'a> {
             .unsqueeze(0);
         Ok(Scored {
             target,
+            gain: self.gains[view],
             truth: truth.to_device(self.device),
             counted: Tensor::from_slice(&scored)
                 .view([1, 1, h, w])
@@ -231,7 +273,7 @@ impl<'a> Dataset<'a> {
     pub(crate) fn straight(&self, view: usize, scale: u32) -> Result<Straight, ImportError> {
         let (camera, world) = self.cameras(view, scale);
         let image = self.scene.load_view(view, &world)?;
-        let (rgb, alpha) = match (self.scene.background, &image.mask) {
+        let (mut rgb, alpha) = match (self.scene.background, &image.mask) {
             (Background::Black, Some(mask)) => unmultiplied(&image, mask),
             (_, Some(mask)) => inside_only(&image, mask),
             (_, None) => {
@@ -239,6 +281,12 @@ impl<'a> Dataset<'a> {
                 inside_only(&image, &silhouette)
             }
         };
+        let gain = self.gains[view];
+        if gain != NO_GAIN {
+            for (value, gain) in rgb.iter_mut().zip(gain.iter().cycle()) {
+                *value = encoded((linear(*value) * gain).clamp(0.0, 1.0));
+            }
+        }
         Ok(Straight { camera, rgb, alpha })
     }
 
@@ -356,10 +404,11 @@ fn inside_only(image: &ViewImage, mask: &[f32]) -> (Vec<f32>, Vec<f32>) {
     (image.rgb.clone(), alpha)
 }
 
-/// Mean squared errors on [0, 255] of `image` [1, 3, H, W] against a view's truth, both as 8-bit files would hold
-/// them: over the full frame and over the object.
+/// Mean squared errors on [0, 255] of `image` ([1, 3, H, W], canonical exposure) against a view's photograph, both as
+/// 8-bit files would hold them: over the full frame and over the object.
 pub(crate) fn errors_255(image: &Tensor, view: &Scored) -> (f64, f64) {
-    let difference = color::quantised(&(image * &view.counted)) - color::quantised(&view.truth);
+    let image = view.photographed(image) * &view.counted;
+    let difference = color::quantised(&image) - color::quantised(&view.truth);
     let squared = (difference * 255.0).square();
     let object = view.object_mask.sum(Kind::Float).clamp_min(1.0) * 3.0;
     let on_object = (&squared * &view.object_mask).sum(Kind::Float) / object;
@@ -399,7 +448,14 @@ mod tests {
         };
         let settings = recipe.resolve(10).expect("settings");
         let parts = |scene: &Scene| {
-            let data = Dataset::new(scene, &recipe, &settings, Device::Cpu).expect("a dataset");
+            let data = Dataset::new(
+                scene,
+                &ign_capture::Gains::none(scene.views.len()),
+                &recipe,
+                &settings,
+                Device::Cpu,
+            )
+            .expect("a dataset");
             let view = data.train[0];
             let straight = data.straight(view, 1).expect("a view");
             (data.scored(view).expect("a view"), straight)

@@ -1,4 +1,5 @@
-//! Scores of every method on the held-out views, through the renderer that ships.
+//! Scores of every method on the held-out views, through the renderer that ships. Renderings are in the canonical
+//! exposure and are brought to the photograph's before they are compared.
 
 use ign_bundle::metrics::{MethodMetrics, Scores, ViewMetrics, WorstView};
 use ign_render::{Target, to_image};
@@ -29,7 +30,7 @@ pub(crate) fn score(
         let start = Instant::now();
         let image = render(&scored.target);
         millis.push(start.elapsed().as_secs_f64() * 1e3);
-        let image = to_image(&(image * &scored.counted));
+        let image = to_image(&(scored.photographed(&image) * &scored.counted));
         let score = Scores::of(&image, &to_image(&scored.truth), &scored.object);
         per_view.push(ViewMetrics {
             name: view.clone(),

@@ -5,11 +5,14 @@ use std::path::PathBuf;
 
 use chrono::{DateTime, SecondsFormat, Utc};
 use ign_bundle::manifest::{
-    MetricsSummary, Networks, ObjectName, Provenance, SCHEMA, StageSeconds,
+    CanonicalExposure, MetricsSummary, Networks, ObjectName, Provenance, SCHEMA, StageSeconds,
 };
 use ign_bundle::metrics::Metrics;
-use ign_bundle::report::{ReportInput, ReportView, render_report};
-use ign_bundle::{BundleWriter, COMPOSITION_FILE, EFFECTS_FILE, Manifest, Precision, Reference};
+use ign_bundle::report::{CaptureLine, ReportInput, ReportView, render_report};
+use ign_bundle::{
+    BundleWriter, COMPOSITION_FILE, EFFECTS_FILE, HeldOutView, Manifest, Precision, Reference,
+};
+use ign_capture::Preflight;
 use ign_nets::color;
 use ign_render::{Effects, Model, NetworkFiles, ReferenceImage, Target, orbit, to_image};
 use image::codecs::jpeg::JpegEncoder;
@@ -38,9 +41,12 @@ pub(crate) struct Finished<'a> {
     pub(crate) data: &'a Dataset<'a>,
     pub(crate) model: &'a Model,
     pub(crate) images: &'a [ReferenceImage],
+    /// The scene's views that they show.
+    pub(crate) chosen: &'a [usize],
     pub(crate) views: &'a [(String, &'a Scored)],
     pub(crate) rows: Vec<Row>,
     pub(crate) metrics: Metrics,
+    pub(crate) preflight: &'a Preflight,
     pub(crate) started_at: DateTime<Utc>,
     pub(crate) reporter: &'a Reporter<'a>,
 }
@@ -53,9 +59,11 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
         data,
         model,
         images,
+        chosen,
         views,
         rows,
         mut metrics,
+        preflight,
         started_at,
         reporter,
     } = finished;
@@ -71,13 +79,14 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
     let writer = BundleWriter::create(&dir)?;
     let references: Vec<Reference> = images
         .iter()
-        .map(|image| Reference {
+        .zip(chosen)
+        .map(|(image, &view)| Reference {
             name: image.name.clone(),
             camera: image.camera,
             width: image.camera.intrinsics.width,
             height: image.camera.intrinsics.height,
             rgba: image.rgba.clone(),
-            exposure_gain: [1.0; 3],
+            exposure_gain: data.gains[view],
             crop: None,
         })
         .collect();
@@ -110,11 +119,15 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
             writer.held_out(name, "target", &to_image(&scored.truth))?;
         }
     }
-    let held_out_cameras: Vec<_> = views
+    let held_out_views: Vec<HeldOutView> = views
         .iter()
-        .map(|(name, scored)| (name.clone(), scored.target.camera))
+        .map(|(name, scored)| HeldOutView {
+            name: name.clone(),
+            camera: scored.target.camera,
+            exposure_gain: scored.gain,
+        })
         .collect();
-    writer.held_out_cameras(&held_out_cameras)?;
+    writer.held_out_views(&held_out_views)?;
     let frames = turntable(data, model, settings.preview_frames, reporter);
     writer.file("preview.webp", &animation(&frames)?)?;
     if let Some(first) = frames.first() {
@@ -160,6 +173,7 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
         metrics: MetricsSummary::from(&metrics),
         normalised_from_world: data.normalisation.into(),
         colour_space: "srgb".into(),
+        canonical_exposure: Some(canonical_exposure(&data.gains)),
         render: serde_json::to_value(&data.settings).unwrap_or_default(),
     };
     let words: Vec<String> = manifest.plan["words"]
@@ -171,6 +185,20 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
                 .collect()
         })
         .unwrap_or_default();
+    let lines: Vec<CaptureLine> = preflight
+        .lines()
+        .into_iter()
+        .map(|line| CaptureLine {
+            subject: line.subject,
+            text: line.text,
+            doubtful: line.doubtful,
+        })
+        .collect();
+    let advice: Vec<String> = preflight
+        .faults
+        .iter()
+        .map(|fault| format!("{} ({}): {}", fault.message, fault.at, fault.hint))
+        .collect();
     let title = data
         .scene
         .info
@@ -183,9 +211,22 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
         metrics: &metrics,
         views: &report_views,
         plan: &words,
+        capture: &lines,
+        advice: &advice,
     }))?;
     writer.finish(manifest)?;
     Ok(dir)
+}
+
+fn canonical_exposure(gains: &[[f32; 3]]) -> CanonicalExposure {
+    let all = || gains.iter().flatten().copied();
+    CanonicalExposure {
+        equalised: all().any(|gain| (gain - 1.0).abs() > f32::EPSILON),
+        gain_range: [
+            all().reduce(f32::min).unwrap_or(1.0),
+            all().reduce(f32::max).unwrap_or(1.0),
+        ],
+    }
 }
 
 /// The worst views first, then an even spread over the rest.

@@ -70,6 +70,14 @@ pub(crate) enum EffectsChoice {
     Off,
 }
 
+/// Whether photographs are brought to one exposure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum GainsChoice {
+    /// Where gains make the photographs agree on points that had no part in estimating them.
+    Auto,
+    Off,
+}
+
 /// The recipe resolved: every number a bake needs.
 #[derive(Clone, Debug)]
 #[expect(
@@ -96,6 +104,7 @@ pub(crate) struct Settings {
     pub(crate) margin: f64,
     /// Whether the proxy may be simplified where no view shows the difference.
     pub(crate) simplify: bool,
+    pub(crate) gains: GainsChoice,
     /// Frames of the turntable preview.
     pub(crate) preview_frames: usize,
 }
@@ -144,6 +153,7 @@ impl Recipe {
             checkpoint_secs: 20.0,
             margin: 0.05,
             simplify: false,
+            gains: GainsChoice::Auto,
             preview_frames: 36,
         };
         for (key, value) in &self.settings {
@@ -172,6 +182,18 @@ impl Settings {
                     }
                 }
             }
+            "gains" => {
+                self.gains = match value {
+                    "auto" => GainsChoice::Auto,
+                    "off" => GainsChoice::Off,
+                    _ => {
+                        return Err(invalid(
+                            format!("gains={value} is unknown"),
+                            "use auto or off",
+                        ));
+                    }
+                }
+            }
             "effects_steps" => self.effects_steps = number(key, value, 1, 10_000_000)?,
             "effects_batch" => self.effects_batch = number(key, value, 64, 1 << 20)?,
             "composition_steps" => self.composition_steps = number(key, value, 1, 10_000_000)?,
@@ -188,7 +210,7 @@ impl Settings {
                 return Err(invalid(
                     format!("setting {key} is unknown"),
                     "known: k, references, supersample, effects, effects_steps, effects_batch, composition_steps, \
-                     batch, patch, ablate_effects, compare_paper, half_weights, checkpoint_secs, margin, simplify, preview_frames",
+                     batch, patch, ablate_effects, compare_paper, half_weights, checkpoint_secs, margin, gains, simplify, preview_frames",
                 ));
             }
         }
@@ -243,6 +265,7 @@ mod tests {
             ("k", "x"),
             ("colour", "1"),
             ("effects", "maybe"),
+            ("gains", "on"),
             ("margin", "NaN"),
         ] {
             let mut recipe = Recipe::default();

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use ign_bundle::metrics::{Metrics, SCHEMA, ViewCounts};
-use ign_capture::ImportOptions;
+use ign_capture::{Gains, ImportError, ImportOptions, Preflight, Survey};
 use ign_events::Event;
 use ign_render::{Model, ReferenceImage, References, RenderSettings, debevec_ibr, naive_ibr};
 use rayon::prelude::*;
@@ -15,7 +15,7 @@ use crate::data::{Dataset, Scored};
 use crate::evaluate::{Row, score};
 use crate::pack::{Finished, pack};
 use crate::progress::Reporter;
-use crate::recipe::{EffectsChoice, Preset, Recipe, Settings};
+use crate::recipe::{EffectsChoice, GainsChoice, Preset, Recipe, Settings};
 use crate::{BakeError, effects};
 
 /// Effects stay when they lower the validation error of plain blending by at least this share.
@@ -67,11 +67,29 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         proxy: job.recipe.proxy.as_ref().map(PathBuf::from),
     };
     let scene = ign_capture::import(&job.capture_dir, &options)?;
-    for fault in &scene.warnings {
+    let settings = job.recipe.resolve(scene.train.len())?;
+    reporter.step(0.2, "comparing the photographs at common surface points");
+    let survey = Survey::new(&scene);
+    let estimated = Gains::estimate(&scene, &survey);
+    let preflight = Preflight::of(
+        &job.capture_dir,
+        &scene,
+        &survey,
+        &estimated,
+        job.recipe.size,
+    );
+    drop(survey);
+    for fault in &preflight.faults {
         reporter.warn(format!("{} ({})", fault.message, fault.at));
     }
-    let settings = job.recipe.resolve(scene.train.len())?;
-    let data = Dataset::new(&scene, &job.recipe, &settings, device)?;
+    if !preflight.ok {
+        return Err(ImportError::Faults(preflight.faults).into());
+    }
+    let gains = match settings.gains {
+        GainsChoice::Auto => estimated,
+        GainsChoice::Off => Gains::none(scene.views.len()),
+    };
+    let data = Dataset::new(&scene, &gains, &job.recipe, &settings, device)?;
     reporter.info(format!(
         "{} views to train on, {} to validate, {} held out; device {}",
         data.train.len(),
@@ -113,10 +131,12 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         validation: &validation,
         held_out: &held_out,
     };
-    let trained = match settings.preset {
+    let mut trained = match settings.preset {
         Preset::Standard => bake.standard(&mut session, model)?,
         Preset::Paper => bake.paper(&mut session, model)?,
     };
+
+    note_capture(&mut trained.plan, &preflight, &gains);
 
     reporter.stage("evaluate", "scoring held-out views");
     let names = data
@@ -148,6 +168,7 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         data: &data,
         model: &trained.model,
         images: &images,
+        chosen: &chosen,
         views: &views,
         rows,
         metrics: Metrics {
@@ -168,11 +189,31 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
             stages: Vec::new(),
             device: ign_nets::device::name(device),
         },
+        preflight: &preflight,
         started_at,
         reporter: &reporter,
     })?;
     reporter.step(1.0, "done");
     Ok(bundle)
+}
+
+/// Puts what was found out about the capture into the plan.
+fn note_capture(plan: &mut serde_json::Value, preflight: &Preflight, gains: &Gains) {
+    let words = if gains.needed {
+        format!(
+            "The photographs differ in exposure: gains per view take away {:.0} % of the differences at surface points that \
+             had no part in estimating them. Everything is learned and rendered in one exposure; scores compare in the \
+             photograph's own.",
+            100.0 * gains.explained
+        )
+    } else {
+        "The photographs are used in their own exposure.".to_owned()
+    };
+    if let Some(list) = plan["words"].as_array_mut() {
+        list.push(words.into());
+    }
+    plan["gains"] = json!({ "applied": gains.needed, "explained": gains.explained });
+    plan["preflight"] = json!(preflight);
 }
 
 /// What training leaves for evaluation.

@@ -21,8 +21,8 @@ pub use manifest::{Manifest, NetworkDescription};
 pub use metrics::Metrics;
 pub use pack::{Bundle, BundleWriter};
 pub use paths::held_out_file;
-pub use references::Reference;
-pub use report::{ReportInput, ReportView, render_report};
+pub use references::{HeldOutView, Reference};
+pub use report::{CaptureLine, ReportInput, ReportView, render_report};
 pub use weights::{Precision, Tensor, Tensors};
 
 /// Name of the manifest inside a bundle.

@@ -40,8 +40,21 @@ pub struct Manifest {
     pub normalised_from_world: WorldTransform,
     /// Of every image: `srgb`.
     pub colour_space: String,
+    /// The exposure of references and renderings; absent in bundles from before there were gains: the photographs' own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub canonical_exposure: Option<CanonicalExposure>,
     /// What the renderer needs beside the networks (K, coverage samples, ...); `ign-render` owns its content.
     pub render: Value,
+}
+
+/// The one exposure and white balance that references are stored in and views are rendered in. The photographs' own,
+/// per view, are `exposure_gain` in `references/views.json` and `held_out/views.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CanonicalExposure {
+    /// Whether photographs were brought to it by gains; otherwise all gains are 1 and it is the photographs' own.
+    pub equalised: bool,
+    /// Smallest and largest gain of any view and channel, linear light.
+    pub gain_range: [f32; 2],
 }
 
 /// Name of an object.

@@ -9,14 +9,14 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use ign_geometry::{Camera, Mesh, Similarity};
+use ign_geometry::{Mesh, Similarity};
 use image::{ExtendedColorType, ImageEncoder, RgbImage, codecs::png::PngEncoder};
 use sha2::{Digest, Sha256};
 use walkdir::WalkDir;
 
 use crate::manifest::{FileRecord, Manifest, NetworkDescription, SCHEMA};
 use crate::paths::{held_out_file, inside};
-use crate::references::{self, HeldOutViews, Reference};
+use crate::references::{self, HeldOutView, HeldOutViews, Reference};
 use crate::weights::{self, Precision, Tensors};
 use crate::{
     BundleError, HELD_OUT_VIEWS_FILE, MANIFEST_FILE, METRICS_FILE, Metrics, PROXY_FILE,
@@ -104,9 +104,9 @@ impl BundleWriter {
         self.file(&path, &encode_png(&path, image)?)
     }
 
-    /// Adds `held_out/views.json`: the normalised frame's camera of each scored image, by the photograph's name.
-    pub fn held_out_cameras(&self, cameras: &[(String, Camera)]) -> Result<(), BundleError> {
-        let json = serde_json::to_vec_pretty(&HeldOutViews::new(cameras))
+    /// Adds `held_out/views.json`: camera and exposure of each scored image.
+    pub fn held_out_views(&self, views: &[HeldOutView]) -> Result<(), BundleError> {
+        let json = serde_json::to_vec_pretty(&HeldOutViews::new(views))
             .map_err(BundleError::json(HELD_OUT_VIEWS_FILE))?;
         self.file(HELD_OUT_VIEWS_FILE, &json)
     }
@@ -250,14 +250,14 @@ impl Bundle {
         }
     }
 
-    /// The cameras of the scored images in the normalised frame, by name; none in a bundle without them.
-    pub fn held_out_cameras(&self) -> Result<Vec<(String, Camera)>, BundleError> {
+    /// Camera and exposure of the scored images; none in a bundle without them.
+    pub fn held_out_views(&self) -> Result<Vec<HeldOutView>, BundleError> {
         if !self.lists(HELD_OUT_VIEWS_FILE) {
             return Ok(Vec::new());
         }
         serde_json::from_slice::<HeldOutViews>(&self.read(HELD_OUT_VIEWS_FILE)?)
             .map_err(BundleError::json(HELD_OUT_VIEWS_FILE))?
-            .cameras()
+            .checked()
     }
 
     fn lists(&self, path: &str) -> bool {
@@ -297,7 +297,7 @@ impl Bundle {
         if self.references()?.is_empty() {
             return Err(BundleError::malformed(VIEWS_FILE, "no reference views"));
         }
-        self.held_out_cameras()?;
+        self.held_out_views()?;
         self.metrics().map(drop)
     }
 }

@@ -29,7 +29,8 @@ pub struct Reference {
     pub height: u32,
     /// `[height, width, 4]`, straight sRGB colour and coverage, 8 bit.
     pub rgba: Vec<u8>,
-    /// Per channel, on sRGB values; what this view was multiplied by to agree with the others.
+    /// Per channel, in linear light: what the photograph was multiplied by to come to the bundle's canonical exposure,
+    /// in which the image is stored. A view in this exposure divided by it looks as photographed.
     pub exposure_gain: [f32; 3],
     /// Part of the undistorted photograph that the image shows.
     pub crop: Option<Crop>,
@@ -91,32 +92,64 @@ pub struct HeldOutRecord {
     pub intrinsics: CameraIntrinsics,
     /// 3 by 4, row-major; normalised frame, x right, y down, z forward.
     pub camera_from_world: [f64; 12],
+    /// See [`HeldOutView::exposure_gain`]. 1 in bundles that were written before there were gains.
+    #[serde(default = "no_gain")]
+    pub exposure_gain: [f32; 3],
+}
+
+/// A held-out view: where its photograph was taken, and in which exposure.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeldOutView {
+    /// The photograph's name.
+    pub name: String,
+    /// Of the scored image, normalised frame.
+    pub camera: Camera,
+    /// Per channel, in linear light: takes the photograph to the bundle's canonical exposure. Renderings were divided by
+    /// it before they were scored.
+    pub exposure_gain: [f32; 3],
+}
+
+fn no_gain() -> [f32; 3] {
+    [1.0; 3]
+}
+
+fn is_gain(gain: &[f32; 3]) -> bool {
+    gain.iter().all(|g| g.is_finite() && *g > 0.0)
 }
 
 impl HeldOutViews {
-    pub(crate) fn new(cameras: &[(String, Camera)]) -> Self {
-        let record = |(name, camera): &(String, Camera)| HeldOutRecord {
-            name: name.clone(),
-            intrinsics: camera.intrinsics,
-            camera_from_world: to_rows(&camera.camera_from_world),
+    pub(crate) fn new(views: &[HeldOutView]) -> Self {
+        let record = |view: &HeldOutView| HeldOutRecord {
+            name: view.name.clone(),
+            intrinsics: view.camera.intrinsics,
+            camera_from_world: to_rows(&view.camera.camera_from_world),
+            exposure_gain: view.exposure_gain,
         };
         Self {
-            views: cameras.iter().map(record).collect(),
+            views: views.iter().map(record).collect(),
         }
     }
 
-    pub(crate) fn cameras(self) -> Result<Vec<(String, Camera)>, BundleError> {
-        let camera = |record: HeldOutRecord| {
+    pub(crate) fn checked(self) -> Result<Vec<HeldOutView>, BundleError> {
+        let view = |record: HeldOutRecord| {
+            let bad = |reason: String| {
+                BundleError::malformed(
+                    crate::HELD_OUT_VIEWS_FILE,
+                    format!("view {:?}: {reason}", record.name),
+                )
+            };
+            if !is_gain(&record.exposure_gain) {
+                return Err(bad("exposure gain is not positive".to_owned()));
+            }
             let camera = Camera::new(record.intrinsics, from_rows(&record.camera_from_world))
-                .map_err(|source| {
-                    BundleError::malformed(
-                        crate::HELD_OUT_VIEWS_FILE,
-                        format!("view {:?}: {source}", record.name),
-                    )
-                })?;
-            Ok((record.name, camera))
+                .map_err(|source| bad(source.to_string()))?;
+            Ok(HeldOutView {
+                name: record.name,
+                camera,
+                exposure_gain: record.exposure_gain,
+            })
         };
-        self.views.into_iter().map(camera).collect()
+        self.views.into_iter().map(view).collect()
     }
 }
 
@@ -192,11 +225,7 @@ pub fn decode(
             if record.size != [record.intrinsics.width, record.intrinsics.height] {
                 return Err(bad("size and intrinsics do not agree".to_owned()));
             }
-            if !record
-                .exposure_gain
-                .iter()
-                .all(|g| g.is_finite() && *g > 0.0)
-            {
+            if !is_gain(&record.exposure_gain) {
                 return Err(bad("exposure gain is not positive".to_owned()));
             }
             let camera = Camera::new(record.intrinsics, from_rows(&record.camera_from_world))

@@ -38,6 +38,21 @@ pub struct ReportInput<'a> {
     pub views: &'a [ReportView],
     /// What the plan decided, a sentence each.
     pub plan: &'a [String],
+    /// What was found out about the capture before it was baked, a line per subject.
+    pub capture: &'a [CaptureLine],
+    /// What to do better in the next capture, a sentence each.
+    pub advice: &'a [String],
+}
+
+/// One finding about the capture.
+#[derive(Clone, Debug)]
+pub struct CaptureLine {
+    /// What it is about.
+    pub subject: String,
+    /// What was found.
+    pub text: String,
+    /// Whether something is wrong with it.
+    pub doubtful: bool,
 }
 
 /// The pictures of one held-out view, as scored.
@@ -69,6 +84,7 @@ pub fn render_report(input: &ReportInput<'_>) -> String {
         methods_section(input.metrics),
         speed_section(input.metrics),
         views_section(input.metrics, &verdict),
+        capture_section(input),
         plan_section(input),
         provenance_section(input),
     ]
@@ -374,6 +390,42 @@ fn plan_section(input: &ReportInput<'_>) -> String {
         .map(|s| format!("<li>{}</li>", escape(s)))
         .collect();
     format!("<section><h2>What the plan decided</h2><ol>{sentences}</ol></section>")
+}
+
+fn capture_section(input: &ReportInput<'_>) -> String {
+    if input.capture.is_empty() {
+        return String::new();
+    }
+    let lines: String = input
+        .capture
+        .iter()
+        .map(|line| {
+            format!(
+                "<dt{}>{}</dt><dd>{}</dd>",
+                if line.doubtful {
+                    " class=\"doubtful\""
+                } else {
+                    ""
+                },
+                escape(&line.subject),
+                escape(&line.text)
+            )
+        })
+        .collect();
+    let advice: String = input
+        .advice
+        .iter()
+        .map(|s| format!("<li>{}</li>", escape(s)))
+        .collect();
+    let advice = if advice.is_empty() {
+        advice
+    } else {
+        format!("<h3>What to do better</h3><ul>{advice}</ul>")
+    };
+    format!(
+        "<section><h2>The capture</h2><p class=\"note\">Measured on the photographs, the reconstruction and the proxy \
+         before anything was trained. Doubtful points are marked.</p><dl>{lines}</dl>{advice}</section>"
+    )
 }
 
 fn provenance_section(input: &ReportInput<'_>) -> String {

@@ -10,15 +10,15 @@ use std::path::Path;
 
 use glam::{DAffine3, DQuat, DVec3};
 use ign_bundle::manifest::{
-    Layer, Manifest, MetricsSummary, NetworkDescription, NetworkInput, Networks, ObjectName,
-    Provenance, StageSeconds,
+    CanonicalExposure, Layer, Manifest, MetricsSummary, NetworkDescription, NetworkInput, Networks,
+    ObjectName, Provenance, StageSeconds,
 };
 use ign_bundle::metrics::{MethodMetrics, Scores, SpeedError, ViewCounts};
 use ign_bundle::references::Crop;
 use ign_bundle::weights::{decode, encode};
 use ign_bundle::{
-    Bundle, BundleError, BundleWriter, COMPOSITION_FILE, MANIFEST_FILE, METRICS_FILE, Metrics,
-    PROXY_FILE, Precision, Reference, Tensor, Tensors, VIEWS_FILE, pack, proxy,
+    Bundle, BundleError, BundleWriter, COMPOSITION_FILE, HeldOutView, MANIFEST_FILE, METRICS_FILE,
+    Metrics, PROXY_FILE, Precision, Reference, Tensor, Tensors, VIEWS_FILE, pack, proxy,
 };
 use ign_geometry::{Camera, CameraIntrinsics, Mesh, Similarity};
 use image::{Rgb, RgbImage};
@@ -126,6 +126,14 @@ fn weights() -> Tensors {
     )])
 }
 
+fn held_out_view() -> HeldOutView {
+    HeldOutView {
+        name: "walk/0007.jpg".into(),
+        camera: reference(7).camera,
+        exposure_gain: [0.9, 1.0, 1.0 / 3.0],
+    }
+}
+
 fn manifest() -> Manifest {
     Manifest {
         schema: "ign.bundle/1".into(),
@@ -174,6 +182,10 @@ fn manifest() -> Manifest {
         metrics: MetricsSummary::from(&metrics()),
         normalised_from_world: WORLD.into(),
         colour_space: "srgb".into(),
+        canonical_exposure: Some(CanonicalExposure {
+            equalised: true,
+            gain_range: [0.5, 1.25],
+        }),
         render: json!({"k": 4}),
     }
 }
@@ -189,9 +201,7 @@ fn write_bundle(dir: &Path) -> Bundle {
     writer
         .held_out("walk/0007.jpg", "ours", &RgbImage::new(12, 12))
         .unwrap();
-    writer
-        .held_out_cameras(&[("walk/0007.jpg".into(), reference(7).camera)])
-        .unwrap();
+    writer.held_out_views(&[held_out_view()]).unwrap();
     writer.report("<!doctype html>").unwrap();
     writer.finish(manifest()).unwrap()
 }
@@ -212,10 +222,7 @@ fn everything_comes_back() {
     assert_eq!(bundle.metrics().unwrap(), Some(metrics()));
     let network = bundle.manifest().networks.composition.clone().unwrap();
     assert_eq!(bundle.weights(&network).unwrap(), weights());
-    assert_eq!(
-        bundle.held_out_cameras().unwrap(),
-        [("walk/0007.jpg".to_owned(), reference(7).camera)]
-    );
+    assert_eq!(bundle.held_out_views().unwrap(), [held_out_view()]);
     let paths: Vec<_> = bundle
         .manifest()
         .files

@@ -6,7 +6,7 @@
 
 use ign_bundle::manifest::{Manifest, StageSeconds};
 use ign_bundle::metrics::{MethodMetrics, Scores, SpeedError, ViewCounts};
-use ign_bundle::{Metrics, ReportInput, ReportView, pack, render_report};
+use ign_bundle::{CaptureLine, Metrics, ReportInput, ReportView, pack, render_report};
 use image::{Rgb, RgbImage};
 use serde_json::json;
 
@@ -163,6 +163,19 @@ fn page(title: &str, metrics: &Metrics, views: &[ReportView]) -> String {
         metrics,
         views,
         plan: &plan,
+        capture: &[
+            CaptureLine {
+                subject: "coverage".into(),
+                text: "94 % of the surface seen by two views; weak: the underside (9 %)".into(),
+                doubtful: true,
+            },
+            CaptureLine {
+                subject: "light".into(),
+                text: "constant".into(),
+                doubtful: false,
+            },
+        ],
+        advice: &["the underside <is> seen by no view: take photographs of it".to_owned()],
     })
 }
 
@@ -181,6 +194,8 @@ fn the_page_is_complete_and_self_contained() {
         "<svg",
         "antiquities / vase-12",
         "GAN loss",
+        "<dt class=\"doubtful\">coverage</dt>",
+        "the underside &lt;is&gt; seen",
     ] {
         assert!(html.contains(expected), "{expected}");
     }

@@ -110,7 +110,7 @@ impl Scene {
     }
 
     /// Top-left corner and side of the square window around the object, in pixels of the undistorted photograph.
-    fn window(&self, view: usize, margin: f64) -> (DVec2, f64) {
+    pub(crate) fn window(&self, view: usize, margin: f64) -> (DVec2, f64) {
         let bounds = &self.bounds[view];
         let extent = bounds.extent();
         let margin = if margin.is_finite() {

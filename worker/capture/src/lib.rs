@@ -17,6 +17,7 @@ mod import;
 mod photo;
 mod photographs;
 mod pixel_map;
+mod preflight;
 mod proxy;
 mod reconstruction;
 mod resample;
@@ -24,12 +25,18 @@ mod scene;
 mod settings;
 mod sight;
 mod split;
+mod survey;
 
 pub use distortion::{CameraModel, SourceCamera};
 pub use fault::{Fault, ImportError, Severity};
 pub use frame::Frame;
 pub use import::{ImportOptions, import};
 pub use photo::PhotoError;
+pub use preflight::{
+    Baselines, BlurredView, Counts, Coverage, Exposure, Findings, Forecast, Light, Line, Preflight,
+    PreflightOptions, Region, Reprojection, Scale, Sharpness, preflight,
+};
 pub use reconstruction::{Format, camera_files, check_cameras};
 pub use resample::ViewImage;
 pub use scene::{Background, CaptureInfo, Mask, MaskFile, Point, Scene, View};
+pub use survey::{Gains, Survey};

@@ -86,6 +86,9 @@ pub struct DemoOptions {
     pub held_out: Option<usize>,
     /// Varies the painting and the camera path.
     pub seed: u64,
+    /// The object turns in front of the lamps and the camera moves only up, down and nearer: seen from the object, the
+    /// lamps go round with the camera. Constant light, which every method here assumes, is then broken.
+    pub turntable: bool,
 }
 
 impl Default for DemoOptions {
@@ -97,6 +100,7 @@ impl Default for DemoOptions {
             views: 96,
             held_out: None,
             seed: 0,
+            turntable: false,
         }
     }
 }
@@ -227,6 +231,7 @@ pub fn generate(
         tracer: &tracer,
         lighting: &lighting,
         gloss: Gloss::new(options.gloss),
+        turntable: options.turntable,
     };
     progress(0, views.len());
     for (done, view) in views.iter().enumerate() {

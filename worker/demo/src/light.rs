@@ -74,6 +74,18 @@ pub(crate) struct ShadePoint {
     pub(crate) albedo: DVec3,
 }
 
+impl ShadePoint {
+    /// The same place of the object after it has turned about its axis by so many radians.
+    pub(crate) fn turned(self, radians: f64) -> Self {
+        Self {
+            position: self.position.rotate_z(radians),
+            normal: self.normal.rotate_z(radians),
+            angle: self.angle + radians,
+            ..self
+        }
+    }
+}
+
 /// The highlight's strength and width.
 #[derive(Clone, Copy)]
 pub(crate) struct Gloss {

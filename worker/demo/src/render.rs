@@ -22,6 +22,8 @@ pub(crate) struct Renderer<'a> {
     pub(crate) tracer: &'a Tracer,
     pub(crate) lighting: &'a Lighting,
     pub(crate) gloss: Gloss,
+    /// The lamps go round the object's axis with the camera.
+    pub(crate) turntable: bool,
 }
 
 /// A rendered view, row-major.
@@ -63,6 +65,13 @@ impl Renderer<'_> {
     }
 
     fn pixel(&self, camera: &Camera, x: u32, y: u32) -> Pixel {
+        let eye = camera.center() - self.surface.center;
+        // From the object's frame to the lamps': the object and its shadows are symmetric about the axis.
+        let turn = if self.turntable {
+            -eye.y.atan2(eye.x)
+        } else {
+            0.0
+        };
         let corner = DVec2::new(f64::from(x), f64::from(y));
         let (mut diffuse, mut specular) = (DVec3::ZERO, DVec3::ZERO);
         let mut covered = 0;
@@ -78,11 +87,11 @@ impl Renderer<'_> {
                     self.paint,
                     ray.origin + ray.direction * hit.t,
                     &hit,
-                );
+                )
+                .turned(turn);
+                let to_eye = DVec3::rotate_z(-ray.direction.normalize_or_zero(), turn);
                 diffuse += self.lighting.diffuse(&point);
-                specular +=
-                    self.lighting
-                        .specular(&point, -ray.direction.normalize_or_zero(), self.gloss);
+                specular += self.lighting.specular(&point, to_eye, self.gloss);
                 covered += 1;
             }
         }

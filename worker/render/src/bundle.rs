@@ -278,11 +278,11 @@ impl BundleRenderer {
     /// No view of that name.
     pub fn view_camera(&self, name: &str) -> Result<Camera, RenderError> {
         let references = self.bundle.references()?;
-        let held_out = self.bundle.held_out_cameras()?;
+        let held_out = self.bundle.held_out_views()?;
         references
             .into_iter()
             .map(|view| (view.name, view.camera))
-            .chain(held_out)
+            .chain(held_out.into_iter().map(|view| (view.name, view.camera)))
             .find(|(known, _)| known == name)
             .map(|(_, camera)| camera)
             .ok_or_else(|| RenderError::UnknownView { name: name.into() })

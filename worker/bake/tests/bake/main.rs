@@ -1,6 +1,7 @@
 //! Whole bakes of tiny captures: the bundle renders what was scored, a resumed bake ends like an unbroken one, bad
 //! settings and hard captures end as they must.
 
+mod gains;
 mod hard;
 
 use std::cell::RefCell;
@@ -92,9 +93,11 @@ fn a_bundle_renders_what_was_scored() {
         }
         assert!(metrics.speed_error.len() >= 4);
         let renderer = BundleRenderer::open(&folder, tch::Device::Cpu).expect("it opens");
-        let cameras = bundle.held_out_cameras().expect("cameras");
-        assert!(!cameras.is_empty());
-        for (view, camera) in cameras {
+        let views = bundle.held_out_views().expect("views");
+        assert!(!views.is_empty());
+        for view in views {
+            assert_eq!(view.exposure_gain.map(f32::to_bits), [1.0_f32.to_bits(); 3]);
+            let (view, camera) = (view.name, view.camera);
             let file = folder.join(ign_bundle::held_out_file(&view, "ours"));
             let scored = image::open(file).expect("an image").into_rgb8();
             let rendered = renderer.render_normalised(&camera);
