@@ -1,4 +1,4 @@
-//! BagIt bags (RFC 8493), as archives keep them: a folder whose payload lies in `data/` with a list of checksums.
+//! `BagIt` bags (RFC 8493), as archives keep them: a folder whose payload lies in `data/` with a list of checksums.
 //!
 //! A bag is verified before anything of it is sent: every payload file is listed with the right checksum, and every
 //! listed file is there. Bags that say where to fetch missing files (`fetch.txt`) are refused: nothing is downloaded.
@@ -145,11 +145,7 @@ fn checksum(file: &Path, algorithm: &str) -> std::io::Result<String> {
     loop {
         let count = reader.read(&mut buffer)?;
         if count == 0 {
-            return Ok(hash
-                .finalize()
-                .iter()
-                .map(|byte| format!("{byte:02x}"))
-                .collect());
+            return Ok(hex::encode(hash.finalize()));
         }
         hash.update(&buffer[..count]);
     }

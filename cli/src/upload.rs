@@ -1,6 +1,7 @@
 //! From a capture folder to a submitted job: hash, send what the store lacks, write the manifest, submit.
 
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -99,7 +100,8 @@ pub(crate) fn request_id(spec: &v1::JobSpec, salt: &str) -> String {
     .join("\n");
     let labels: BTreeMap<&String, &String> = spec.labels.iter().collect();
     for (key, value) in labels {
-        text.push_str(&format!("\n{key:?}={value:?}"));
+        // Writing to a String cannot fail.
+        let _infallible = write!(text, "\n{key:?}={value:?}");
     }
     Digest::of(text.as_bytes()).hex()[..32].to_string()
 }

@@ -3,6 +3,8 @@
 //! `tests/frozen/VERSION` holds the contract as that version was released; it is never edited. With the next release the
 //! contract of that release is added.
 
+#![expect(clippy::unwrap_used, reason = "helpers of tests")]
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 

@@ -519,8 +519,8 @@ async fn what_nothing_names_goes_slowly(fixture: Fixture) {
 /// A client finds that the store has its files from long ago, so it sends none; then it puts the manifest, and submits.
 /// Two collections come between any of these steps.
 async fn a_collection_at_any_point_of_a_submit_loses_nothing(fixture: Fixture) {
-    let registry = &fixture.registry;
     const STEPS: usize = 4;
+    let registry = &fixture.registry;
     for first in 0..=STEPS {
         for second in first..=STEPS {
             let bytes = Bytes::from(format!("{first} {second}"));

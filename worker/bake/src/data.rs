@@ -483,14 +483,18 @@ mod tests {
             let x = (at % 48) as u32;
             if is_ignored(x) {
                 on_object += usize::from(whole.object[at]);
-                assert_eq!((counted[at], part.object[at]), (0.0, false));
-                assert_eq!(part_straight.alpha[at], 0.0);
+                let zero = 0.0_f32.to_bits();
+                assert_eq!((counted[at].to_bits(), part.object[at]), (zero, false));
+                assert_eq!(part_straight.alpha[at].to_bits(), zero);
                 for channel in 0..3 {
-                    assert_eq!(truth[channel * 48 * 48 + at], 0.0);
+                    assert_eq!(truth[channel * 48 * 48 + at].to_bits(), zero);
                 }
             } else if x > 24 {
                 assert_eq!(part.object[at], whole.object[at]);
-                assert_eq!(part_straight.alpha[at], whole_straight.alpha[at]);
+                assert_eq!(
+                    part_straight.alpha[at].to_bits(),
+                    whole_straight.alpha[at].to_bits()
+                );
                 for channel in 0..3 {
                     let at = channel * 48 * 48 + at;
                     assert!((truth[at] - whole_truth[at]).abs() < 1e-6);

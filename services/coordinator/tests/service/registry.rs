@@ -21,8 +21,8 @@ fn reference(object: &str, reference: &str) -> v1::GetBundleRequest {
     }
 }
 
-fn cause(status: tonic::Status) -> Cause {
-    Cause::from_status(&status)
+fn cause(status: &tonic::Status) -> Cause {
+    Cause::from_status(status)
 }
 
 impl Service {
@@ -205,7 +205,7 @@ async fn garbage_goes_and_what_is_named_stays() {
         dry_run: true,
         grace_secs: 60.0,
     };
-    let refused = cause(service.admin.collect_garbage(short).await.unwrap_err());
+    let refused = cause(&service.admin.collect_garbage(short).await.unwrap_err());
     assert_eq!(refused.reason(), "BAD_FIELD");
 
     // Retired and ended long ago: the files of v1 go, its number and record stay.
@@ -250,7 +250,7 @@ async fn garbage_goes_and_what_is_named_stays() {
         .bundles
         .restore(reference("museum/vase", "v1"))
         .await;
-    assert_eq!(cause(gone.unwrap_err()).reason(), "FILES_COLLECTED");
+    assert_eq!(cause(&gone.unwrap_err()).reason(), "FILES_COLLECTED");
 
     // A job whose capture was collected cannot be tried again.
     let cancel = v1::GetJobRequest {
@@ -268,7 +268,7 @@ async fn garbage_goes_and_what_is_named_stays() {
     assert_eq!(retried.get_ref().state(), v1::JobState::Queued);
     service.jobs.cancel(cancel.clone()).await.unwrap();
     std::fs::remove_dir_all(service.folder.join("store/manifests")).unwrap();
-    let refused = cause(service.jobs.retry(cancel).await.unwrap_err());
+    let refused = cause(&service.jobs.retry(cancel).await.unwrap_err());
     assert_eq!(refused.reason(), "CAPTURE_MISSING");
 
     let kinds: Vec<String> = service
@@ -346,7 +346,7 @@ async fn a_full_disk_refuses_new_work_and_lets_the_rest_go_on() {
         .jobs
         .submit(submit_request("museum/vase", "request-3", &capture))
         .await;
-    let refused = cause(refused.unwrap_err());
+    let refused = cause(&refused.unwrap_err());
     assert_eq!(refused.reason(), "FULL");
     assert!(refused.to_string().contains("nearly full"), "{refused}");
     assert!(service.lease("worker-1", 0.2).await.is_none());
@@ -410,7 +410,7 @@ async fn a_dead_database_refuses_clearly_and_costs_nothing_that_was_acknowledged
         .jobs
         .submit(submit_request("museum/vase", "request-2", &capture))
         .await;
-    let refused = cause(refused.unwrap_err());
+    let refused = cause(&refused.unwrap_err());
     assert_eq!(refused.reason(), "UNAVAILABLE");
     assert!(refused.to_string().contains("database"), "{refused}");
     let late = service.complete(&lease, "worker-1", &[("bundle.json", b"one")]);

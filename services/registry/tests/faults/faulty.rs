@@ -11,9 +11,9 @@ use futures::stream::{self, BoxStream};
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 use object_store::{
-    CopyOptions, Error, GetOptions, GetResult, GetResultPayload, ListResult, MultipartUpload,
-    ObjectMeta, ObjectStore, PutMode, PutMultipartOptions, PutOptions, PutPayload, PutResult,
-    RenameOptions, Result,
+    CopyOptions, Error, Extensions, GetOptions, GetResult, GetResultPayload, ListResult,
+    MultipartUpload, ObjectMeta, ObjectStore, PutMode, PutMultipartOptions, PutOptions, PutPayload,
+    PutResult, RenameOptions, Result,
 };
 use rand::{RngExt, SeedableRng as _};
 use rand_pcg::Pcg64Mcg;
@@ -156,7 +156,7 @@ impl ObjectStore for Faulty {
                         return Ok(PutResult {
                             e_tag: None,
                             version: None,
-                            extensions: Default::default(),
+                            extensions: Extensions::default(),
                         });
                     }
                 }

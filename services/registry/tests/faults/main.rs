@@ -197,7 +197,7 @@ async fn a_conditional_put_that_lies_is_found_out_at_start() {
     }
 }
 
-fn is_full<T: std::fmt::Debug>(result: Result<T, RegistryError>) -> bool {
+fn is_full<T: std::fmt::Debug>(result: &Result<T, RegistryError>) -> bool {
     matches!(result, Err(RegistryError::Full { .. }))
 }
 
@@ -216,19 +216,19 @@ async fn a_full_store_says_so_and_what_makes_room_still_works() {
 
     let more = content(3, 100);
     let large = content(4, 9 * 1024 * 1024);
-    assert!(is_full(registry.put_bytes(more.clone()).await));
+    assert!(is_full(&registry.put_bytes(more.clone()).await));
     assert!(is_full(
-        registry
+        &registry
             .put_stream(&Digest::of(&large), NO_LIMIT, body(large.clone()))
             .await
     ));
-    assert!(is_full(registry.create_upload(&object()).await));
+    assert!(is_full(&registry.create_upload(&object()).await));
     assert!(is_full(
-        registry
+        &registry
             .append_upload(&object(), id, 0, NO_LIMIT, body(more.clone()))
             .await
     ));
-    assert!(is_full(registry.put_manifest(&capture).await));
+    assert!(is_full(&registry.put_manifest(&capture).await));
     assert_eq!(read(&registry, &Digest::of(&kept)).await, kept);
 
     registry.drop_upload(id).await.unwrap();
