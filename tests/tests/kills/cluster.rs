@@ -80,7 +80,10 @@ impl Cluster {
         let url = format!("http://{}/readyz", self.listen);
         let begun = Instant::now();
         loop {
-            let ready = self.runtime.block_on(self.http.get(&url).send());
+            // Within the runtime: the client's time limit begins with the call.
+            let ready = self
+                .runtime
+                .block_on(async { self.http.get(&url).send().await });
             if ready.is_ok_and(|ready| ready.status().is_success()) {
                 return Ok(());
             }

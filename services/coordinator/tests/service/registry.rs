@@ -185,7 +185,7 @@ async fn the_registry_is_rebuilt_from_the_bucket_alone_byte_for_byte() {
 #[tokio::test]
 async fn garbage_goes_and_what_is_named_stays() {
     let mut service = Service::start().await;
-    let first = service.publish("museum/vase", "request-1", b"one").await;
+    let first = service.publish("museum/vase", "request-1", b"first").await;
     service.publish("museum/vase", "request-2", b"two").await;
     let orphan = service.upload("museum/vase", b"orphan").await;
     let live = service.submit("museum/bust", "request-3").await;
@@ -221,7 +221,7 @@ async fn garbage_goes_and_what_is_named_stays() {
         moved.objects, 1,
         "the file of v1 alone: the capture is that of a live job"
     );
-    let one = Digest::of(b"one");
+    let one = Digest::of(b"first");
     assert!(!service.blob(&one).exists());
     // Restored within the grace, it is whole again.
     let restored = service
