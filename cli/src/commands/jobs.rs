@@ -636,10 +636,16 @@ mod tests {
     fn times_have_units() {
         let secs = |text: &str| duration(text).map(|time| time.as_secs());
         assert_eq!(
-            [secs("90"), secs("90s"), secs("1.5m"), secs("2h")],
-            [Ok(90), Ok(90), Ok(90), Ok(7200)]
+            [
+                secs("90"),
+                secs("90s"),
+                secs("1.5m"),
+                secs("2h"),
+                secs("7d")
+            ],
+            [Ok(90), Ok(90), Ok(90), Ok(7200), Ok(604_800)]
         );
-        for bad in ["", "m", "-1s", "1d", "1..2s", "1e999h"] {
+        for bad in ["", "m", "-1s", "1w", "1..2s", "1e999h"] {
             assert!(duration(bad).is_err(), "{bad}");
         }
     }

@@ -37,6 +37,10 @@ fn write_file(root: &Path, name: &str, content: &[u8]) {
 
 /// An agent whose child is this program; ends when its stdin does.
 fn agent(url: &str, dir: &str, name: &str) {
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .with_ansi(false)
+        .init();
     let token = std::env::var("IGN_TEST_TOKEN").unwrap();
     let config = ign_agent::AgentConfig {
         name: Some(name.to_owned()),
