@@ -7,6 +7,8 @@
 //!
 //! What is drawn does not depend on how the triangles are split: see [`crate::raster`].
 
+use std::cmp::Ordering;
+
 use glam::{DVec3, Vec3};
 use rayon::prelude::{IntoParallelRefIterator, ParallelIterator};
 
@@ -118,6 +120,27 @@ impl Drawable {
     /// A box around everything that can be drawn.
     pub(crate) fn bounds(&self) -> Bounds {
         self.bounds
+    }
+
+    /// Which of two triangles that can be drawn comes first by the coordinates of its corners, in the triangle's order,
+    /// then their normals; of exact copies, the one of the lower index. Nothing but their place in the mesh differs in
+    /// copies, so that what is drawn of them does not.
+    pub(crate) fn first(&self, triangle: u32, other: u32) -> u32 {
+        let corners = |triangle: u32| {
+            let (cluster, corners) = self.corners(triangle);
+            let vertices = [&cluster.positions, &cluster.normals];
+            vertices
+                .into_iter()
+                .flat_map(move |values| corners.map(|corner| values[corner]))
+                .flat_map(|value| value.to_array())
+        };
+        let order = corners(triangle).zip(corners(other));
+        let order = order.map(|(here, there)| here.total_cmp(&there));
+        match order.fold(Ordering::Equal, Ordering::then) {
+            Ordering::Less => triangle,
+            Ordering::Greater => other,
+            Ordering::Equal => triangle.min(other),
+        }
     }
 
     /// Where a triangle that was drawn is kept: its cluster, and the vertices of its corners there.

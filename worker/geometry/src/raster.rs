@@ -9,9 +9,10 @@
 //! - *Watertight.* The edge function of an edge is computed from the same end points in the same order whichever
 //!   triangle asks, so two triangles that share an edge get exactly opposite values, and a sample exactly on it
 //!   belongs to one of them (top-left rule). Copies of a vertex are projected to the same bits.
-//! - *Deterministic.* The nearest surface wins, ties go to the lower triangle index; neither threads, nor the order of
-//!   drawing, nor what was left out matter: a cluster is hidden only if every sample it could meet already holds a
-//!   strictly nearer surface.
+//! - *Deterministic.* The nearest surface wins, to the precision of f32; ties are decided by where the triangles lie
+//!   ([`Drawable::first`]). So neither the order of triangles in the mesh, nor threads, nor the order of drawing, nor
+//!   what was left out matter: a cluster is hidden only if every sample it could meet already holds a strictly nearer
+//!   surface.
 //! - Both sides of a triangle are drawn: proxies of real captures are open and their winding is not reliable.
 //! - Whatever is not finite, also as the f32 that maps are made of, is not drawn.
 
@@ -146,7 +147,7 @@ pub(crate) struct Surface<'a> {
 /// The nearest triangle at each sample of a band.
 #[derive(Default)]
 pub(crate) struct DepthBuffer {
-    /// Row-major, `width` a row. A key orders by nearness, then by triangle index; see [`key`].
+    /// Row-major, `width` a row: how far, and which triangle; see [`key`].
     pub(crate) keys: Vec<u64>,
     width: usize,
     /// The farthest surface of each tile of `TILE` x `TILE` samples, as [`farness`]. May be out of date: too far.
@@ -214,7 +215,7 @@ fn farness(inverse_depth: f64) -> u32 {
     !(inverse_depth as f32).to_bits()
 }
 
-/// What a sample keeps the smallest of.
+/// What a sample keeps the nearest of: [`farness`] above, the triangle's index below.
 #[inline]
 fn key(inverse_depth: f64, triangle: u32) -> u64 {
     (u64::from(farness(inverse_depth)) << 32) | u64::from(triangle)
@@ -399,10 +400,24 @@ impl<'a> View<'a> {
                 &mut projected,
                 |row, column, inverse_depth, triangle| {
                     let kept = &mut keys.keys[(row - top) * across + column];
-                    *kept = key(inverse_depth, triangle).min(*kept);
+                    let new = key(inverse_depth, triangle);
+                    *kept = if (new ^ *kept) >> 32 == 0 {
+                        self.tied(new, *kept)
+                    } else {
+                        new.min(*kept)
+                    };
                 },
             );
             keys.mark(&columns, &lines);
+        }
+    }
+
+    /// Which of two keys of one depth a sample keeps.
+    #[cold]
+    fn tied(&self, new: u64, kept: u64) -> u64 {
+        match (key_triangle(new), key_triangle(kept)) {
+            (Some(triangle), Some(other)) if self.drawable.first(triangle, other) == other => kept,
+            _ => new,
         }
     }
 
@@ -893,17 +908,26 @@ mod tests {
     }
 
     #[test]
-    fn ties_go_to_the_lower_index() {
+    fn ties_go_to_the_triangle_whose_corners_come_first() {
         let camera = camera();
         let at = |x: f64, y: f64| camera.unproject(DVec2::new(x, y), 2.0);
+        // Vertex 2 lies between the others by its coordinates.
         let positions = vec![at(0.0, 0.0), at(80.0, 0.0), at(0.0, 80.0)];
-        let mesh = Mesh::new(positions, vec![[0, 1, 2], [0, 2, 1], [1, 2, 0]]).expect("valid");
-        assert!(
-            rasterize(&mesh, &camera)
-                .triangle
-                .iter()
-                .all(|triangle| *triangle == 0)
-        );
+        let ways = [[0, 1, 2], [0, 2, 1], [1, 2, 0], [0, 2, 1]];
+        for turn in 0..ways.len() {
+            let mut triangles = ways.to_vec();
+            triangles.rotate_left(turn);
+            let first = triangles.iter().position(|way| *way == [0, 2, 1]);
+            // Put together by hand: a valid mesh holds no copies.
+            let mut mesh = Mesh::new(positions.clone(), vec![[0, 1, 2]]).expect("valid");
+            mesh.triangles = triangles;
+            let drawn = rasterize(&mesh, &camera).triangle;
+            assert!(
+                drawn
+                    .iter()
+                    .all(|triangle| Some(*triangle as usize) == first)
+            );
+        }
     }
 
     #[test]
