@@ -157,7 +157,7 @@ impl<'a> Dataset<'a> {
             },
         };
         let mesh = scene.mesh.transformed(&normalisation);
-        let mut data = Self {
+        Ok(Self {
             scene,
             proxy: Drawable::new(&mesh),
             mesh,
@@ -175,19 +175,17 @@ impl<'a> Dataset<'a> {
                 .map(|gain| gain.map(|channel| channel as f32))
                 .collect(),
             device,
-        };
-        data.settle_proxy(settings.simplify);
-        Ok(data)
+        })
     }
 
-    /// Simplifies the proxy as far as the training views allow, if `wanted`, and says so.
-    fn settle_proxy(&mut self, wanted: bool) {
+    /// Simplifies the proxy as far as the training views allow at the references' resolution, if `wanted`, and says so.
+    pub(crate) fn settle_proxy(&mut self, wanted: bool) {
         let given = count(self.mesh.triangles.len());
         let cameras: Vec<Camera> = self
             .scene
             .train
             .iter()
-            .map(|&view| self.cameras(view, 1).0)
+            .map(|&view| self.cameras(view, self.reference_scale).0)
             .collect();
         let simplified = wanted.then(|| simplify(&self.mesh, &cameras)).flatten();
         let words = match simplified {

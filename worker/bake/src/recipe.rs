@@ -152,7 +152,7 @@ impl Recipe {
             half_weights: false,
             checkpoint_secs: 20.0,
             margin: 0.05,
-            simplify: false,
+            simplify: true,
             gains: GainsChoice::Auto,
             preview_frames: 36,
         };

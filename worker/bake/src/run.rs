@@ -89,7 +89,7 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         GainsChoice::Auto => estimated,
         GainsChoice::Off => Gains::none(scene.views.len()),
     };
-    let data = Dataset::new(&scene, &gains, &job.recipe, &settings, device)?;
+    let mut data = Dataset::new(&scene, &gains, &job.recipe, &settings, device)?;
     reporter.info(format!(
         "{} views to train on, {} to validate, {} held out; device {}",
         data.train.len(),
@@ -97,7 +97,6 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         data.held_out.len(),
         ign_nets::device::name(device),
     ));
-    reporter.info(data.proxy_words.clone());
     let checkpoints = job.work_dir.join("checkpoints");
     let mut session = Session::open(
         &reporter,
@@ -109,7 +108,12 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
     )?;
 
     reporter.stage("plan", "choosing reference views");
+    // On the proxy as given: what a view covers must not hang on how coarse a proxy suffices.
     let chosen = data.choose_references(settings.references);
+    reporter.step(0.2, "fitting the proxy to the views");
+    data.settle_proxy(settings.simplify);
+    reporter.info(data.proxy_words.clone());
+    let data = data;
     let images = data.reference_images(&chosen)?;
     reporter.step(0.4, "loading validation and held-out views");
     let load = |views: &[usize]| {

@@ -41,6 +41,10 @@ const LEAST_TRIANGLES: usize = 200;
 const CLOSING_STEPS: usize = 3;
 /// A collapse that leaves more than this share of the triangles it started from gets nowhere.
 const STUCK: f64 = 0.95;
+/// Steps of the radius in which the collapse sees positions, a power of two: fine beside any triangle worth its bytes,
+/// coarse beside the rounding of coordinates in the millions. Which edges go depends on every bit, and must not depend
+/// on how far the mesh lies from its world's origin. The mesh that comes out keeps its own positions.
+const STEPS: f64 = 65_536.0;
 /// Vertices at one place are one if their normals are at most about 45 degrees apart; a sharp edge stays sharp.
 const SAME_NORMAL: f64 = 0.7;
 
@@ -292,13 +296,17 @@ impl Drawn {
     }
 }
 
+/// Positions around the middle in whole [`STEPS`] of the radius, wherever the mesh lies.
+fn steps(mesh: &Mesh) -> Vec<DVec3> {
+    let (center, radius) = mesh.bounding_sphere();
+    let steps = |position: &DVec3| ((*position - center) / radius * STEPS).round();
+    mesh.positions.iter().map(steps).collect()
+}
+
 /// The mesh with vertices at one place and of about one normal joined, as collapses need them.
 fn welded(mesh: &Mesh) -> Option<Mesh> {
-    let key = |vertex: u32| {
-        (mesh.positions[vertex as usize] + 0.0)
-            .to_array()
-            .map(f64::to_bits)
-    };
+    let steps = steps(mesh);
+    let key = |vertex: u32| steps[vertex as usize].to_array().map(|step| step as i64);
     let mut order: Vec<u32> = (0..mesh.positions.len() as u32).collect();
     order.par_sort_unstable_by_key(|&vertex| (key(vertex), vertex));
     let mut joined: Vec<u32> = (0..mesh.positions.len() as u32).collect();
@@ -338,12 +346,9 @@ fn welded(mesh: &Mesh) -> Option<Mesh> {
 
 /// The mesh with about `target` triangles; `None` when that cannot be reached.
 fn collapsed(mesh: &Mesh, target: usize) -> Option<Mesh> {
-    // In f32, around the middle and in units of the size, wherever the mesh lies.
-    let (center, radius) = mesh.bounding_sphere();
-    let positions: Vec<[f32; 3]> = mesh
-        .positions
-        .iter()
-        .map(|position| ((*position - center) / radius).as_vec3().to_array())
+    let positions: Vec<[f32; 3]> = steps(mesh)
+        .into_iter()
+        .map(|steps| (steps / STEPS).as_vec3().to_array())
         .collect();
     // The result's error is judged by looking, so the collapse itself may go as far as it likes.
     let unlimited = 1.0;
@@ -395,6 +400,8 @@ pub(crate) fn compact(mesh: &Mesh, triangles: &[[u32; 3]]) -> Option<Mesh> {
 
 #[cfg(test)]
 mod tests {
+    use glam::DAffine3;
+
     use super::*;
     use crate::CameraIntrinsics;
 
@@ -464,6 +471,28 @@ mod tests {
         }
         assert_eq!(simplify(&mesh, &cameras(32)), Some(small), "deterministic");
         assert_eq!(simplify(&mesh, &[]), None);
+    }
+
+    #[test]
+    fn far_from_the_worlds_origin_the_same_triangles_stay() {
+        let (mesh, views) = (ball(60, false), cameras(32));
+        let here = simplify(&mesh, &views).expect("much to spare");
+        let offset = DVec3::new(4.5e5, 5.2e6, 1.1e6);
+        let mut far = mesh.clone();
+        for position in &mut far.positions {
+            *position += offset;
+        }
+        let moved = DAffine3::from_translation(-offset);
+        let views: Vec<Camera> = views
+            .iter()
+            .map(|view| {
+                Camera::new(view.intrinsics, view.camera_from_world * moved).expect("a camera")
+            })
+            .collect();
+        let there = simplify(&far, &views).expect("much to spare");
+        assert_ne!(far.positions[7] - offset, mesh.positions[7], "rounded");
+        assert_eq!(here.mesh.triangles, there.mesh.triangles);
+        assert_eq!(here.mesh.normals, there.mesh.normals);
     }
 
     #[test]
