@@ -25,8 +25,8 @@ use std::process::ExitCode;
 use clap::{CommandFactory as _, Parser};
 
 use crate::commands::{
-    admin, bake, bundle, collections, completions, doctor, jobs, preflight, status, submit, token,
-    up,
+    admin, bake, bundle, collections, completions, doctor, jobs, preflight, report, status, submit,
+    token, up,
 };
 use crate::connection::ConnectionArgs;
 use crate::output::Format;
@@ -88,6 +88,8 @@ enum Command {
     /// Look at model bundles, fetch and verify them
     #[command(subcommand)]
     Bundle(bundle::Command),
+    /// Write one page on a collection: what is good, what stands out, what to photograph again
+    Report(report::Args),
     /// Make, list, rotate and revoke bearer tokens
     #[command(subcommand)]
     Token(token::Command),
@@ -161,6 +163,7 @@ async fn run(cli: Cli) -> Result<(), Problem> {
         Command::Wait(args) => jobs::wait(&context, &args).await,
         Command::Collections(command) => collections::run(&context, &command).await,
         Command::Bundle(command) => bundle::run(&context, &command).await,
+        Command::Report(args) => report::run(&context, &args).await,
         Command::Token(command) => token::run(&context, &command).await,
         Command::Admin(command) => admin::run(&context, &command).await,
         Command::Doctor(args) => doctor::run(&context, &args).await,

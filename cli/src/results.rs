@@ -52,6 +52,27 @@ impl Files {
         self.0.size_bytes()
     }
 
+    /// Reads one file, checked against its digest, by way of a file on disk; none when the bundle has no such file.
+    pub(crate) async fn read(
+        &self,
+        connection: &Connection,
+        object: &ObjectName,
+        name: &str,
+        by_way_of: &Path,
+    ) -> Result<Option<Vec<u8>>, Problem> {
+        let Some(file) = self.0.files().iter().find(|f| f.path.as_str() == name) else {
+            return Ok(None);
+        };
+        let store = connection.data_plane(object)?;
+        store
+            .download(&file.digest, file.size_bytes, Some(by_way_of), &|_| ())
+            .await
+            .map_err(|problem| problem.context(name))?;
+        Ok(Some(
+            std::fs::read(by_way_of).doing("cannot read", by_way_of.display())?,
+        ))
+    }
+
     /// Writes the files into `dir`, which is empty; without a folder, reads and checks them only.
     pub(crate) async fn fetch(
         &self,

@@ -50,6 +50,14 @@ pub(crate) struct Query {
 }
 
 impl Query {
+    /// All jobs of a collection.
+    pub(crate) fn of(collection: CollectionId) -> Self {
+        Self {
+            collection: Some(collection),
+            ..Self::default()
+        }
+    }
+
     fn is_empty(&self) -> bool {
         self.state.is_empty()
             && self.collection.is_none()
@@ -155,7 +163,10 @@ async fn find(connection: &Connection, name: &str) -> Result<v1::Job, Problem> {
 }
 
 /// All pages of a listing, newest job first.
-async fn list_all(connection: &Connection, query: &Query) -> Result<Vec<v1::Job>, Problem> {
+pub(crate) async fn list_all(
+    connection: &Connection,
+    query: &Query,
+) -> Result<Vec<v1::Job>, Problem> {
     let (collection, object) = match (&query.object, &query.collection) {
         (Some(name), _) => (name.collection.to_string(), name.object.to_string()),
         (None, Some(collection)) => (collection.to_string(), String::new()),

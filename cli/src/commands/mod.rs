@@ -9,6 +9,7 @@ pub(crate) mod doctor;
 pub(crate) mod jobs;
 pub(crate) mod manifest;
 pub(crate) mod preflight;
+pub(crate) mod report;
 pub(crate) mod status;
 pub(crate) mod submit;
 pub(crate) mod token;

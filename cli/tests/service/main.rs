@@ -283,6 +283,24 @@ fn a_bake_ends_with_everything_in_its_folder() {
     assert_eq!(service.run(&fetch).status.code(), Some(0));
     assert!(fetched.join("bundle.json").is_file());
 
+    let page = work.path().join("museum.html");
+    let report = ["report", "museum", "--out", page.to_str().unwrap()];
+    let written = service.run(&report);
+    assert_eq!(written.status.code(), Some(0), "{}", stderr(&written));
+    insta::assert_snapshot!(
+        "report_of_a_collection",
+        stdout(&written).replace(page.to_str().unwrap(), "PAGE")
+    );
+    let text = std::fs::read_to_string(&page).unwrap();
+    assert!(text.contains("<h1>museum</h1>") && text.ends_with("</html>\n"));
+    let nobody = service.run(&["report", "nobody", "--out", page.to_str().unwrap()]);
+    assert_eq!(nobody.status.code(), Some(1), "{}", stderr(&nobody));
+    assert_eq!(
+        std::fs::read_to_string(&page).unwrap(),
+        text,
+        "the former page stays"
+    );
+
     // A damaged file is found, on disk and in the store.
     std::fs::write(out.join("bundle/report.html"), "changed").unwrap();
     assert_eq!(

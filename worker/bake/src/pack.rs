@@ -11,6 +11,7 @@ use ign_bundle::metrics::Metrics;
 use ign_bundle::report::{CaptureLine, ReportInput, ReportView, render_report};
 use ign_bundle::{
     BundleWriter, COMPOSITION_FILE, EFFECTS_FILE, HeldOutView, Manifest, Precision, Reference,
+    THUMBNAIL_FILE,
 };
 use ign_capture::Preflight;
 use ign_nets::color;
@@ -131,7 +132,7 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
     let frames = turntable(data, model, settings.preview_frames, reporter);
     writer.file("preview.webp", &animation(&frames)?)?;
     if let Some(first) = frames.first() {
-        writer.file("thumbnail.jpg", &jpeg(first)?)?;
+        writer.file(THUMBNAIL_FILE, &jpeg(first)?)?;
     }
 
     let report_views = report_views(views, &rows, model);
@@ -141,7 +142,7 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
         .into_iter()
         .map(|(name, secs)| StageSeconds { name, secs })
         .collect();
-    let bytes: u64 = written_bytes(&dir, &["held_out", "preview.webp", "thumbnail.jpg"])?;
+    let bytes: u64 = written_bytes(&dir, &["held_out", "preview.webp", THUMBNAIL_FILE])?;
     for method in &mut metrics.methods {
         method.bundle_bytes = bytes;
     }
@@ -333,7 +334,7 @@ fn jpeg(image: &RgbImage) -> Result<Vec<u8>, BakeError> {
             ExtendedColorType::Rgb8,
         )
         .map_err(|source| BakeError::Picture {
-            file: "thumbnail.jpg",
+            file: THUMBNAIL_FILE,
             source,
         })?;
     Ok(bytes)

@@ -37,6 +37,8 @@ pub const HELD_OUT_VIEWS_FILE: &str = "held_out/views.json";
 pub const METRICS_FILE: &str = "metrics.json";
 /// Name of the report inside a bundle.
 pub const REPORT_FILE: &str = "report.html";
+/// Name of the small picture inside a bundle.
+pub const THUMBNAIL_FILE: &str = "thumbnail.jpg";
 /// Name of `EffectsNet`'s weights inside a bundle.
 pub const EFFECTS_FILE: &str = "effects.safetensors";
 /// Name of `CompositionNet`'s weights inside a bundle.

@@ -17,10 +17,14 @@ use crate::Metrics;
 use crate::manifest::Manifest;
 use crate::metrics::MethodMetrics;
 
+mod collection;
 mod pictures;
 mod plot;
 mod verdict;
 
+pub use collection::{
+    CollectionInput, CollectionObject, Need, Ranked, WithoutBundle, rank, render_collection,
+};
 use pictures::{ErrorScale, figure};
 use plot::{Axis, Plot, Series};
 use verdict::Verdict;
@@ -89,10 +93,15 @@ pub fn render_report(input: &ReportInput<'_>) -> String {
         provenance_section(input),
     ]
     .concat();
+    page(&format!("{title}: model report"), &body)
+}
+
+/// A whole page; `title` and `body` are HTML.
+fn page(title: &str, body: &str) -> String {
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
-         <meta name=\"color-scheme\" content=\"light dark\"><title>{title}: model report</title>\
+         <meta name=\"color-scheme\" content=\"light dark\"><title>{title}</title>\
          <style>{}</style></head><body><main>{body}</main></body></html>\n",
         include_str!("report/style.css")
     )
@@ -376,7 +385,7 @@ fn views_section(metrics: &Metrics, verdict: &Verdict) -> String {
         "<section><h2>Error along the camera path</h2><p class=\"note\">Each held-out view in the capture's order: ours \
          (filled) and {} (ring). Views to look at are marked.</p><div class=\"wide\">{}</div></section>",
         method_label(&baseline.name),
-        plot::views(&rows)
+        plot::views(&rows, "error of each held-out view")
     )
 }
 

@@ -263,7 +263,7 @@ fn tick(value: f64, unit: Unit) -> String {
     }
 }
 
-/// One held-out view in [`views`].
+/// One held-out view, or object, in [`views`].
 pub(super) struct ViewRow<'a> {
     pub(super) name: &'a str,
     pub(super) ours: f64,
@@ -271,8 +271,8 @@ pub(super) struct ViewRow<'a> {
     pub(super) marked: bool,
 }
 
-/// Error of each view from left to right, logarithmic, ours and the baseline joined by a line.
-pub(super) fn views(rows: &[ViewRow<'_>]) -> String {
+/// Error of each view from left to right, logarithmic, ours and the baseline joined by a line; `label` says what it is.
+pub(super) fn views(rows: &[ViewRow<'_>], label: &str) -> String {
     const HEIGHT: f64 = 220.0;
     const BOTTOM: f64 = 190.0;
     let errors = rows
@@ -332,7 +332,7 @@ pub(super) fn views(rows: &[ViewRow<'_>]) -> String {
         })
         .collect();
     format!(
-        "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"error of each held-out view\">{grid}\
+        "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{label}\">{grid}\
          <text class=\"axis\" x=\"{left}\" y=\"14\">mean squared error, 0 to 255</text>{marks}</svg>"
     )
 }

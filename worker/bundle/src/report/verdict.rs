@@ -115,7 +115,8 @@ impl Verdict {
     }
 }
 
-fn shortened(views: &[String]) -> String {
+/// The first few names.
+pub(super) fn shortened(views: &[String]) -> String {
     const SHOWN: usize = 5;
     let names = views
         .iter()
