@@ -8,6 +8,19 @@ use serde::{Deserialize, Serialize};
 
 use crate::problem::Problem;
 
+/// Methods that the worker can score beside ours.
+const METHODS: [&str; 9] = [
+    "vertex_color",
+    "texture",
+    "n_ibr",
+    "ibr",
+    "pix2pix_position",
+    "pix2pix_depth",
+    "ours_no_effects",
+    "paper",
+    "none",
+];
+
 /// How to bake.
 #[derive(Clone, Debug, clap::Args)]
 #[command(next_help_heading = "Recipe")]
@@ -18,6 +31,10 @@ pub(crate) struct RecipeArgs {
     /// Longer side of the rendered images, in pixels
     #[arg(long, value_name = "PX", default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=8192))]
     pub(crate) size: u32,
+    /// Methods to score beside ours [default: those that need no training: `vertex_color,texture,n_ibr,ibr`]; the others each
+    /// train for as long as ours
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', value_parser = METHODS)]
+    pub(crate) methods: Vec<String>,
     /// A setting of the preset, or `crop=none` to keep the whole frame; may be given again
     #[arg(long, value_name = "KEY=VALUE", value_parser = key_value)]
     pub(crate) set: Vec<(String, String)>,
@@ -63,6 +80,10 @@ impl RecipeArgs {
             proxy,
             settings: BTreeMap::new(),
         };
+        if !self.methods.is_empty() {
+            let methods = self.methods.join(",");
+            recipe.settings.insert("methods".to_string(), methods);
+        }
         for (key, value) in &self.set {
             match key.as_str() {
                 "crop" if matches!(value.as_str(), "object" | "none") => {
@@ -72,7 +93,7 @@ impl RecipeArgs {
                     return Err(Problem::usage(format!("crop is {value:?}"))
                         .hint("--set crop=object (default) or --set crop=none"));
                 }
-                "preset" | "size" | "seed" | "budget_secs" | "proxy" => {
+                "preset" | "size" | "seed" | "budget_secs" | "proxy" | "methods" => {
                     return Err(Problem::usage(format!("{key} is not a setting"))
                         .hint(format!("use --{} instead", key.replace('_', "-"))));
                 }
@@ -102,6 +123,7 @@ mod tests {
         RecipeArgs {
             preset: "standard".into(),
             size: 128,
+            methods: vec!["ibr".into(), "paper".into()],
             set: set.iter().map(|text| key_value(text).unwrap()).collect(),
             budget_secs: Some(60),
             seed: 7,
@@ -113,13 +135,13 @@ mod tests {
         let recipe = args(&["lr=1e-3", "crop=none", "epochs=3"]).recipe(Some("proxy/p.ply".into()));
         insta::assert_snapshot!(
             recipe.unwrap().json().unwrap(),
-            @r#"{"preset":"standard","size":128,"crop":"none","seed":7,"budget_secs":60,"proxy":"proxy/p.ply","settings":{"epochs":"3","lr":"1e-3"}}"#
+            @r#"{"preset":"standard","size":128,"crop":"none","seed":7,"budget_secs":60,"proxy":"proxy/p.ply","settings":{"epochs":"3","lr":"1e-3","methods":"ibr,paper"}}"#
         );
     }
 
     #[test]
     fn what_has_a_flag_is_not_a_setting() {
-        for wrong in ["crop=middle", "size=3", "budget_secs=3"] {
+        for wrong in ["crop=middle", "size=3", "budget_secs=3", "methods=ibr"] {
             assert_eq!(
                 args(&[wrong]).recipe(None).unwrap_err().exit,
                 Exit::Usage,

@@ -26,6 +26,9 @@ pub(crate) struct Options {
     /// Views held out [default: an eighth].
     #[arg(long)]
     held_out: Option<usize>,
+    /// Hold out so many frames of one round about the object instead.
+    #[arg(long, value_name = "FRAMES", conflicts_with_all = ["held_out", "turntable"])]
+    orbit: Option<usize>,
     /// Varies painting and camera path.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -41,10 +44,14 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         size: options.size,
         views: options.views,
         held_out: options.held_out,
+        orbit: options.orbit,
         seed: options.seed,
         turntable: options.turntable,
     };
-    let steps = std::cell::RefCell::new(Steps::new("views traced", options.views as u64));
+    let steps = std::cell::RefCell::new(Steps::new(
+        "views traced",
+        (options.views + options.orbit.unwrap_or(0)) as u64,
+    ));
     let summary = ign_demo::generate(&options.out, &demo, &|done, _total| {
         steps.borrow_mut().set(done as u64);
     })?;

@@ -1,7 +1,7 @@
 //! The worker binary.
 //!
 //! `agent` takes jobs from a coordinator; it never touches torch. `exec` bakes one job in a process of its own,
-//! which may crash without harm. `render` and `demo-capture` are for people.
+//! which may crash without harm. `render`, `demo-capture` and `experiment` are for people.
 //!
 //! Streams: data on stdout (events of `exec`, paths of written files), the rest on stderr. Exit codes: 0 done,
 //! 1 failed, 2 wrong usage.
@@ -10,6 +10,7 @@ mod agent;
 mod cameras;
 mod demo;
 mod exec;
+mod experiment;
 mod gpu;
 mod output;
 mod render;
@@ -36,6 +37,8 @@ enum Command {
     Render(render::Options),
     /// Generate a capture of a painted, glossy object, with ground truth.
     DemoCapture(demo::Options),
+    /// Repeat one of the paper's experiments: bakes, and a table and a plot of what they found.
+    Experiment(experiment::Options),
     /// Print a shell's completion script.
     Completions {
         /// The shell.
@@ -51,6 +54,7 @@ fn main() -> ExitCode {
         Command::Agent(options) => agent::run(options),
         Command::Exec(options) => return exec::run(&options),
         Command::Render(options) => render::run(&options),
+        Command::Experiment(options) => experiment::run(&options),
         Command::DemoCapture(options) => demo::run(&options),
         Command::Completions { shell } => {
             let mut command = Cli::command();

@@ -7,15 +7,17 @@
 
 use ign_bundle::metrics::SpeedError;
 use ign_events::Event;
-use ign_nets::optim::{Adam, AdamState};
-use ign_nets::params::{Params, flat_values};
+use ign_nets::optim::{AdamState, Trainee};
+use ign_nets::params::{Builder, Params, flat_values};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use tch::Device;
 
 use crate::BakeError;
+use crate::divergence::{Fallback, Watchdog};
 use crate::progress::Reporter;
 use crate::recipe::Recipe;
 
@@ -25,18 +27,13 @@ const META_KEY: &str = "ign";
 const KEPT_FILES: u64 = 3;
 /// Observations per stage: validation error, best weights, points of the speed-against-error curve.
 const OBSERVATIONS: u64 = 8;
-/// How often a stage may fall back to its last good state before the bake gives up.
+/// How often a stage may fall back to its last good state before it ends.
 const MAX_FALLBACKS: u32 = 4;
-
-/// A network in training.
-#[derive(Debug)]
-pub(crate) struct Trainee {
-    pub(crate) params: Params,
-    pub(crate) adam: Adam,
-}
+/// Factor of the learning rate at every fallback.
+const SLOWER: f64 = 0.25;
 
 /// Weights by name: shape and values.
-pub(crate) type Weights = BTreeMap<String, (Vec<i64>, Vec<f32>)>;
+type Weights = BTreeMap<String, (Vec<i64>, Vec<f32>)>;
 
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Meta {
@@ -48,6 +45,7 @@ struct Meta {
     secs: BTreeMap<String, f64>,
     measured: BTreeMap<String, f64>,
     curve: Vec<SpeedError>,
+    fallbacks: Vec<Fallback>,
 }
 
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -58,28 +56,10 @@ struct Current {
     observed: u64,
     rate_scale: f64,
     fallbacks: u32,
+    watchdog: Watchdog,
     adam_steps: Vec<u64>,
     /// Lowest observed error.
     best_error: Option<f64>,
-}
-
-/// What a stage's training leaves.
-pub(crate) struct Outcome {
-    pub(crate) trainees: Vec<Trainee>,
-    /// Averaged weights of the first network at the observation with the lowest error.
-    best: Option<Vec<f32>>,
-}
-
-impl Outcome {
-    /// The first network with its averaged weights of the best observation; without observations, of the end.
-    pub(crate) fn best(&self) -> Result<Params, BakeError> {
-        let Trainee { params, adam } = &self.trainees[0];
-        let averaged = adam.averaged(params);
-        if let Some(best) = &self.best {
-            averaged.restore(best)?;
-        }
-        Ok(averaged)
-    }
 }
 
 /// How long a stage trains.
@@ -87,6 +67,30 @@ impl Outcome {
 pub(crate) struct Schedule {
     pub(crate) steps: u64,
     pub(crate) budget_secs: Option<f64>,
+}
+
+/// One network's training.
+pub(crate) struct Stage<'a> {
+    /// In checkpoints.
+    pub(crate) name: &'static str,
+    pub(crate) schedule: Schedule,
+    /// What is measured on the way.
+    pub(crate) watch: Option<Watch<'a>>,
+}
+
+/// Views that are rendered now and then while a network trains.
+pub(crate) struct Watch<'a> {
+    /// Row of metrics.json whose speed-against-error curve this is.
+    pub(crate) method: &'static str,
+    /// Training seconds spent before this stage on what the method needs.
+    pub(crate) secs_before: f64,
+    /// Whether the weights of the lowest validation error are kept, not those of the end. The curve is the error of what
+    /// would be kept if training ended there.
+    pub(crate) keep_best: bool,
+    /// Error on the validation views; `None` when there are none.
+    pub(crate) validation: &'a dyn Fn(&Params) -> Option<f64>,
+    /// Errors on the held-out views, full frame and object; they decide nothing.
+    pub(crate) held_out: &'a dyn Fn(&Params) -> (f64, f64),
 }
 
 /// State of a bake that survives its process.
@@ -159,6 +163,7 @@ impl<'a> Session<'a> {
                 secs: BTreeMap::new(),
                 measured: BTreeMap::new(),
                 curve: Vec::new(),
+                fallbacks: Vec::new(),
             },
             weights: BTreeMap::new(),
             resumed: None,
@@ -171,14 +176,34 @@ impl<'a> Session<'a> {
         Ok(session)
     }
 
-    /// Weights of a stage that ended, averaged.
-    pub(crate) fn finished(&self, stage: &str) -> Option<&Weights> {
-        self.meta
-            .finished
-            .iter()
-            .any(|name| name == stage)
-            .then(|| self.weights.get(stage))
-            .flatten()
+    /// Whether a stage has ended.
+    pub(crate) fn finished(&self, stage: &str) -> bool {
+        self.meta.finished.iter().any(|name| name == stage)
+    }
+
+    /// A network for `stage`, which has ended, with its weights.
+    ///
+    /// # Errors
+    /// A checkpoint without these weights, or with others.
+    pub(crate) fn restore<N>(
+        &self,
+        stage: &str,
+        device: Device,
+        register: impl FnOnce(&mut Builder) -> N,
+    ) -> Result<(N, Params), BakeError> {
+        let mut builder = Builder::new();
+        let net = register(&mut builder);
+        let mut params = builder.build(device, 0);
+        let weights = self
+            .weights
+            .get(stage)
+            .ok_or_else(|| unusable(&self.dir, &format!("it lacks the weights of {stage}")))?;
+        params.import(|name| {
+            weights
+                .get(name)
+                .map(|(shape, values)| (shape.as_slice(), values.as_slice()))
+        })?;
+        Ok((net, params))
     }
 
     /// Training seconds of a stage so far.
@@ -211,39 +236,48 @@ impl<'a> Session<'a> {
         &self.meta.curve
     }
 
-    /// Trains one stage to its end, from where a checkpoint left it.
+    /// Trainings that diverged and went back.
+    pub(crate) fn fallbacks(&self) -> &[Fallback] {
+        &self.meta.fallbacks
+    }
+
+    /// Trains one stage to its end, from where a checkpoint left it, and keeps its first network's averaged weights.
     ///
     /// `step` trains once and returns the loss; it gets the step's number, the fraction of the stage that is done and
-    /// a factor for its learning rate. `observe` is called about [`OBSERVATIONS`] times with the training seconds so
-    /// far. Time spent observing or saving does not count.
+    /// a factor for its learning rate. The stage is watched about [`OBSERVATIONS`] times; time spent on that or on saving
+    /// does not count. A training that diverges goes back to the last observation with a lower rate, and after
+    /// [`MAX_FALLBACKS`] of these ends with its best weights.
+    ///
+    /// # Errors
+    /// A checkpoint that cannot be written, or a divergence without weights to keep.
     pub(crate) fn train(
         &mut self,
-        stage: &'static str,
+        stage: &Stage<'_>,
         mut trainees: Vec<Trainee>,
-        schedule: Schedule,
         mut step: impl FnMut(&mut [Trainee], u64, f64, f64) -> f64,
-        mut observe: impl FnMut(&mut Self, &[Trainee], f64) -> Result<Option<f64>, BakeError>,
-    ) -> Result<Outcome, BakeError> {
+    ) -> Result<(), BakeError> {
+        let name = stage.name;
         let mut best = None;
         let mut current = match self.meta.current.take() {
-            Some(current) if current.stage == stage => {
+            Some(current) if current.stage == name => {
                 if let Some(snapshot) = self.resumed.take() {
                     snapshot.restore(&mut trainees)?;
                     best = snapshot.best;
                 }
                 self.reporter.info(format!(
-                    "{stage}: resumed at step {} from the checkpoint",
+                    "{name}: resumed at step {} from the checkpoint",
                     current.step
                 ));
                 current
             }
             _ => Current {
-                stage: stage.into(),
+                stage: name.into(),
                 step: 0,
                 elapsed_secs: 0.0,
                 observed: 0,
                 rate_scale: 1.0,
                 fallbacks: 0,
+                watchdog: Watchdog::default(),
                 adam_steps: Vec::new(),
                 best_error: None,
             },
@@ -254,23 +288,18 @@ impl<'a> Session<'a> {
         let mut elapsed = before;
         let mut paused = 0.0;
         loop {
-            let by_steps = current.step as f64 / schedule.steps.max(1) as f64;
-            let by_time = schedule
+            let by_steps = current.step as f64 / stage.schedule.steps.max(1) as f64;
+            let by_time = stage
+                .schedule
                 .budget_secs
                 .map_or(0.0, |budget| elapsed / budget.max(1e-3));
             let fraction = by_steps.max(by_time).min(1.0);
             if fraction * OBSERVATIONS as f64 >= current.observed as f64 {
                 let pause = Instant::now();
                 current.observed += 1;
-                let error = observe(self, &trainees, elapsed)?;
-                if let Some(error) = error {
-                    self.reporter.error(error);
-                    if current.best_error.is_none_or(|lowest| error <= lowest) {
-                        current.best_error = Some(error);
-                        best = Some(flat_values(
-                            trainees[0].adam.averaged(&trainees[0].params).flat(),
-                        ));
-                    }
+                if let Some(watch) = &stage.watch {
+                    let averaged = trainees[0].adam.averaged(&trainees[0].params);
+                    self.observe(watch, &averaged, &mut current, &mut best);
                 }
                 good = (current.clone(), Snapshot::of(&trainees, best.as_ref()));
                 paused += pause.elapsed().as_secs_f64();
@@ -278,23 +307,34 @@ impl<'a> Session<'a> {
             if fraction >= 1.0 {
                 break;
             }
+            let skipped = skipped_steps(&trainees);
             let loss = step(&mut trainees, current.step, fraction, current.rate_scale);
+            let applied = skipped_steps(&trainees) == skipped;
             current.step += 1;
-            if !loss.is_finite() {
-                if good.0.fallbacks >= MAX_FALLBACKS {
+            if let Some(reason) = current.watchdog.diverged(loss, applied) {
+                let ended = good.0.fallbacks >= MAX_FALLBACKS;
+                if ended && best.is_none() {
                     return Err(BakeError::Diverged {
-                        stage,
+                        stage: name,
                         step: current.step,
                     });
                 }
-                self.reporter.warn(format!(
-                    "{stage}: the loss at step {} is not finite; back to step {} with half the learning rate",
-                    current.step, good.0.step
-                ));
                 good.0.fallbacks += 1;
-                good.0.rate_scale *= 0.5;
+                good.0.rate_scale *= SLOWER;
+                let fallback = Fallback {
+                    stage: name.into(),
+                    step: current.step,
+                    back_to: good.0.step,
+                    rate_scale: if ended { 0.0 } else { good.0.rate_scale },
+                    reason: reason.into(),
+                };
+                self.reporter.warn(fallback.words());
+                self.meta.fallbacks.push(fallback);
                 current = good.0.clone();
                 good.1.restore(&mut trainees)?;
+                if ended {
+                    break;
+                }
             }
             elapsed = before + clock.elapsed().as_secs_f64() - paused;
             current.elapsed_secs = elapsed;
@@ -306,18 +346,61 @@ impl<'a> Session<'a> {
                 paused += pause.elapsed().as_secs_f64();
             }
         }
-        self.meta.secs.insert(stage.into(), elapsed);
-        let skipped: u64 = trainees.iter().map(|t| t.adam.skipped()).sum();
+        self.meta.secs.insert(name.into(), elapsed);
+        let skipped = skipped_steps(&trainees);
         if skipped > 0 {
             self.reporter.warn(format!(
-                "{stage}: {skipped} steps had gradients that were not finite and were left out"
+                "{name}: {skipped} steps had gradients that were not finite and were left out"
             ));
         }
-        Ok(Outcome { trainees, best })
+        let Trainee { params, adam } = &trainees[0];
+        let averaged = adam.averaged(params);
+        if let Some(best) = &best {
+            averaged.restore(best)?;
+        }
+        self.finish(name, &averaged)
+    }
+
+    /// Measures a network in training: keeps its weights where they are the best, adds a point to the curve.
+    fn observe(
+        &mut self,
+        watch: &Watch<'_>,
+        averaged: &Params,
+        current: &mut Current,
+        best: &mut Option<Vec<f32>>,
+    ) {
+        let error = (watch.validation)(averaged);
+        if let Some(error) = error {
+            self.reporter.error(error);
+        }
+        let better = match (error, current.best_error) {
+            (Some(error), Some(lowest)) => error <= lowest,
+            _ => true,
+        };
+        if watch.keep_best && better {
+            current.best_error = error;
+            *best = Some(flat_values(averaged.flat()));
+        }
+        let before = self
+            .meta
+            .curve
+            .iter()
+            .rfind(|point| point.method == watch.method)
+            .map(|point| (point.mse, point.mse_object));
+        let (mse, mse_object) = match before {
+            Some(errors) if watch.keep_best && !better => errors,
+            _ => (watch.held_out)(averaged),
+        };
+        self.curve_point(SpeedError {
+            method: watch.method.into(),
+            secs: watch.secs_before + current.elapsed_secs,
+            mse,
+            mse_object,
+        });
     }
 
     /// Keeps a stage's weights and writes a checkpoint.
-    pub(crate) fn finish(&mut self, stage: &str, params: &Params) -> Result<(), BakeError> {
+    fn finish(&mut self, stage: &str, params: &Params) -> Result<(), BakeError> {
         let weights = params
             .export()
             .into_iter()
@@ -440,7 +523,7 @@ impl<'a> Session<'a> {
                 adam: Vec::new(),
                 best: None,
             };
-            if current.best_error.is_some() {
+            if file.names().contains(&"current/best") {
                 snapshot.best = Some(values("current/best")?.1);
             }
             for (index, &steps) in current.adam_steps.iter().enumerate() {
@@ -460,6 +543,11 @@ impl<'a> Session<'a> {
         (self.meta, self.weights, self.resumed) = (meta, weights, resumed);
         Ok(())
     }
+}
+
+/// Steps whose gradient was not finite.
+fn skipped_steps(trainees: &[Trainee]) -> u64 {
+    trainees.iter().map(|trainee| trainee.adam.skipped()).sum()
 }
 
 fn unusable(path: &Path, reason: &dyn std::fmt::Display) -> BakeError {
@@ -482,12 +570,187 @@ fn floats(data: &[u8]) -> Vec<f32> {
         .collect()
 }
 
-/// Copies stored weights into a network.
-pub(crate) fn load_weights(params: &mut Params, weights: &Weights) -> Result<(), BakeError> {
-    params.import(|name| {
-        weights
-            .get(name)
-            .map(|(shape, values)| (shape.as_slice(), values.as_slice()))
-    })?;
-    Ok(())
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ign_nets::params::Init;
+    use tch::{Tensor, no_grad};
+
+    /// One number, to be brought to 0 by plain gradient descent on its square.
+    fn number(builder: &mut Builder) -> ign_nets::ParamId {
+        builder.param("x", &[1], Init::Constant(1.0))
+    }
+
+    fn value(params: &Params) -> f64 {
+        f64::from(flat_values(params.flat())[0])
+    }
+
+    /// Descends at `rate`: above 1 every step leads further away.
+    fn descend(trainee: &Trainee, rate: f64) -> f64 {
+        let x = value(&trainee.params);
+        let moved = no_grad(|| {
+            let mut flat = trainee.params.flat().shallow_clone();
+            flat -= Tensor::from_slice(&[(2.0 * rate * x) as f32]);
+            flat
+        });
+        drop(moved);
+        x * x
+    }
+
+    /// Errors are the number's square.
+    fn watch() -> Watch<'static> {
+        Watch {
+            method: "ours",
+            secs_before: 3.0,
+            keep_best: true,
+            validation: &|params| Some(value(params).powi(2)),
+            held_out: &|params| (value(params).powi(2), 0.0),
+        }
+    }
+
+    /// Trains with `step`; returns the outcome, the weight that is kept and the fallbacks.
+    fn trained(
+        watched: bool,
+        step: impl FnMut(&mut [Trainee], u64, f64, f64) -> f64,
+    ) -> (Result<(), BakeError>, f64, Vec<Fallback>, Vec<String>) {
+        let dir = tempfile::tempdir().expect("a folder");
+        let said = std::cell::RefCell::new(Vec::new());
+        let sink = |event| {
+            if let Event::Log { message, .. } = event {
+                said.borrow_mut().push(message);
+            }
+        };
+        let reporter = Reporter::new(&sink);
+        let mut session = Session::open(
+            &reporter,
+            dir.path(),
+            1e9,
+            &Recipe::default(),
+            "sha256:0",
+            None,
+        )
+        .expect("a session");
+        let mut builder = Builder::new();
+        number(&mut builder);
+        let trainee = Trainee::new(builder.build(Device::Cpu, 0), 0.0);
+        let watch = watch();
+        let stage = Stage {
+            name: "test",
+            schedule: Schedule {
+                steps: 64,
+                budget_secs: None,
+            },
+            watch: watched.then_some(watch),
+        };
+        let outcome = session.train(&stage, vec![trainee], step);
+        let kept = session
+            .restore("test", Device::Cpu, number)
+            .map_or(f64::NAN, |(_, params)| value(&params));
+        let fallbacks = session.fallbacks().to_vec();
+        drop(session);
+        (outcome, kept, fallbacks, said.into_inner())
+    }
+
+    /// Steps move the weights past Adam, whose average follows by itself: one step of it with no gradient.
+    fn step(trainees: &mut [Trainee], rate: f64) -> f64 {
+        let loss = descend(&trainees[0], rate);
+        assert!(trainees[0].step(0.0, 1.0));
+        loss
+    }
+
+    #[test]
+    fn a_rate_that_diverges_is_noticed_within_a_few_steps_and_lowered() {
+        let (outcome, kept, fallbacks, said) =
+            trained(true, |trainees, _, _, scale| step(trainees, 2.0 * scale));
+        outcome.expect("it ends");
+        assert_eq!(fallbacks.len(), 1, "{fallbacks:?}");
+        let fallback = &fallbacks[0];
+        assert!(fallback.step <= 6 && fallback.back_to == 0, "{fallback:?}");
+        assert!((fallback.rate_scale - 0.25).abs() < 1e-12);
+        assert!(said.contains(&fallback.words()), "{said:?}");
+        assert!(kept.abs() < 1e-6, "{kept}");
+    }
+
+    #[test]
+    fn a_poisoned_batch_costs_the_steps_since_the_last_observation() {
+        let mut poisoned = false;
+        let (outcome, kept, fallbacks, _) = trained(true, |trainees, at, _, scale| {
+            if at == 20 && !poisoned {
+                poisoned = true;
+                drop(no_grad(|| {
+                    trainees[0].params.flat().shallow_clone().fill_(f64::NAN)
+                }));
+                return f64::NAN;
+            }
+            step(trainees, 0.1 * scale)
+        });
+        outcome.expect("it ends");
+        assert_eq!(
+            (fallbacks.len(), fallbacks[0].step, fallbacks[0].back_to),
+            (1, 21, 16)
+        );
+        assert!(kept.abs() < 0.05, "{kept}");
+    }
+
+    #[test]
+    fn a_stage_that_cannot_go_on_ends_with_its_best_weights_or_says_so() {
+        let poison = |trainees: &mut [Trainee], at: u64, scale: f64| {
+            let loss = step(trainees, 0.1 * scale);
+            if at < 20 { loss } else { f64::INFINITY }
+        };
+        let (outcome, kept, fallbacks, _) =
+            trained(true, |trainees, at, _, scale| poison(trainees, at, scale));
+        outcome.expect("it ends");
+        assert_eq!(fallbacks.len(), MAX_FALLBACKS as usize + 1);
+        assert!(
+            fallbacks
+                .last()
+                .is_some_and(|last| last.words().contains("for good"))
+        );
+        assert!(kept > 0.0 && kept < 0.1, "{kept}");
+        let (outcome, ..) = trained(false, |trainees, at, _, scale| poison(trainees, at, scale));
+        assert!(matches!(
+            outcome,
+            Err(BakeError::Diverged {
+                stage: "test",
+                step: 21
+            })
+        ));
+    }
+
+    /// What is kept never gets worse, and the curve says what would be kept.
+    #[test]
+    fn the_curve_of_the_best_weights_never_rises() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let reporter = Reporter::new(&|_| {});
+        let recipe = Recipe::default();
+        let mut session = Session::open(&reporter, dir.path(), 1e9, &recipe, "sha256:0", None)
+            .expect("a session");
+        let mut builder = Builder::new();
+        number(&mut builder);
+        let trainee = Trainee::new(builder.build(Device::Cpu, 0), 0.0);
+        let stage = Stage {
+            name: "test",
+            schedule: Schedule {
+                steps: 64,
+                budget_secs: None,
+            },
+            watch: Some(watch()),
+        };
+        // Down for half of the time, then slowly up again.
+        let train = |trainees: &mut [Trainee], at: u64, _, _| {
+            step(trainees, if at < 32 { 0.05 } else { -0.02 })
+        };
+        session
+            .train(&stage, vec![trainee], train)
+            .expect("it ends");
+        let curve: Vec<f64> = session.curve().iter().map(|point| point.mse).collect();
+        assert_eq!(curve.len(), OBSERVATIONS as usize + 1);
+        assert!(curve.windows(2).all(|pair| pair[1] <= pair[0]), "{curve:?}");
+        assert!(session.curve().iter().all(|point| point.secs >= 3.0));
+        let (_, kept) = session
+            .restore("test", Device::Cpu, number)
+            .expect("weights");
+        assert!((value(&kept).powi(2) - curve[curve.len() - 1]).abs() < 1e-9);
+    }
 }

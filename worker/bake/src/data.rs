@@ -17,7 +17,7 @@ use ign_geometry::select::Candidates;
 use ign_geometry::simplify::simplify;
 use ign_geometry::{Camera, Drawable, Mesh, Similarity};
 use ign_nets::color;
-use ign_render::{CoverageRule, ReferenceImage, RenderSettings, Target};
+use ign_render::{COVERAGE_CELLS, CoverageRule, ReferenceImage, RenderSettings, Target};
 use rayon::prelude::*;
 use tch::{Device, Kind, Tensor};
 
@@ -127,15 +127,18 @@ impl<'a> Dataset<'a> {
         let supersample = settings.supersample;
         let reference_scale = scene.useful_scale(&frame, supersample);
         let coverage = match scene.background {
-            Background::Black if reference_scale > 1 => CoverageRule::EncodedCells,
+            Background::Black if scene.useful_scale(&frame, COVERAGE_CELLS) > 1 => {
+                CoverageRule::EncodedCells
+            }
             Background::Black => CoverageRule::EncodedPixel,
             Background::MaskedOut | Background::Silhouette => CoverageRule::Fraction,
         };
-        let every = VALIDATION_EVERY.max(scene.train.len().div_ceil(VALIDATION_MOST));
+        let corpus = spread(&scene.train, settings.train_views);
+        let every = VALIDATION_EVERY.max(corpus.len().div_ceil(VALIDATION_MOST));
         let mut train = Vec::new();
         let mut validation = Vec::new();
-        for (at, &view) in scene.train.iter().enumerate() {
-            if scene.train.len() >= VALIDATION_EVERY && at % every == every / 2 {
+        for (at, &view) in corpus.iter().enumerate() {
+            if corpus.len() >= VALIDATION_EVERY && at % every == every / 2 {
                 validation.push(view);
             } else {
                 train.push(view);
@@ -219,11 +222,15 @@ impl<'a> Dataset<'a> {
         (world.transformed(self.normalisation), world)
     }
 
-    /// Loads a view as it is scored.
-    pub(crate) fn scored(&self, view: usize) -> Result<Scored, BakeError> {
+    /// Loads a view as it is scored, drawn as `settings` say.
+    pub(crate) fn scored(
+        &self,
+        view: usize,
+        settings: &RenderSettings,
+    ) -> Result<Scored, BakeError> {
         let (camera, world) = self.cameras(view, 1);
         let image = self.scene.load_view(view, &world)?;
-        let target = Target::new(&self.proxy, &camera, &self.settings, self.device);
+        let target = Target::new(&self.proxy, &camera, settings, self.device);
         let (h, w) = target.size();
         let pixels = (h * w) as usize;
         let silhouette = ign_nets::params::flat_values(&target.coverage);
@@ -302,15 +309,17 @@ impl<'a> Dataset<'a> {
         chosen.into_iter().map(|at| self.train[at]).collect()
     }
 
-    /// Loads the reference views as the bundle stores them: 8 bit, straight colour and weight.
+    /// Loads reference views as a bundle stores them: 8 bit, straight colour and weight, `scale` times the working
+    /// resolution.
     pub(crate) fn reference_images(
         &self,
         chosen: &[usize],
+        scale: u32,
     ) -> Result<Vec<ReferenceImage>, BakeError> {
         chosen
             .par_iter()
             .map(|&view| {
-                let straight = self.straight(view, self.reference_scale)?;
+                let straight = self.straight(view, scale)?;
                 let rgba = straight
                     .alpha
                     .iter()
@@ -333,6 +342,12 @@ impl<'a> Dataset<'a> {
             })
             .collect()
     }
+}
+
+/// At most `most` of all, evenly spread.
+fn spread(all: &[usize], most: usize) -> Vec<usize> {
+    let kept = all.len().min(most);
+    (0..kept).map(|at| all[at * all.len() / kept]).collect()
 }
 
 /// A number with its thousands set apart.
@@ -456,7 +471,7 @@ mod tests {
             .expect("a dataset");
             let view = data.train[0];
             let straight = data.straight(view, 1).expect("a view");
-            (data.scored(view).expect("a view"), straight)
+            (data.scored(view, &data.settings).expect("a view"), straight)
         };
         let masks = dir.join("masks");
         std::fs::remove_dir_all(&masks).expect("masks of the demo");

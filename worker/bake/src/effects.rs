@@ -7,21 +7,20 @@
 
 use ign_nets::effects::{PaperEffects, PointEffects};
 use ign_nets::losses::{self, Pair};
-use ign_nets::optim::{Adam, cosine_rate};
+use ign_nets::optim::{Trainee, cosine_rate};
+use ign_nets::steps::{self, SPARSITY, SiamesePair};
 use ign_nets::warp::{Sources, directions};
 use ign_nets::{Builder, Params};
-use ign_render::{Effects, Target};
+use ign_render::{RenderSettings, Target};
 use rand::RngExt;
 use rayon::prelude::*;
 use tch::{Device, Kind, Tensor};
 
 use crate::BakeError;
-use crate::checkpoint::{Schedule, Session, Trainee, load_weights};
+use crate::checkpoint::{Schedule, Session, Stage};
 use crate::data::Dataset;
 use crate::sampler::{indices, step_rng};
 
-/// Weight of the l1 norm of the effects (paper: 0.01).
-const SPARSITY: f64 = 0.01;
 /// Weights average over about so many steps' worth: 1 / (1 - decay).
 const AVERAGE_DECAY: f64 = 0.995;
 /// Peak learning rate of the point effects (paper: 1e-3 constant for its U-Net).
@@ -187,30 +186,6 @@ fn padded<T: Copy + Default>(from: &[T], width: u32, channels: usize, to: (u32, 
     out
 }
 
-/// A network from finished weights.
-pub(crate) fn restore(
-    data: &Dataset<'_>,
-    session: &Session<'_>,
-    stage: &str,
-    paper: bool,
-) -> Result<Option<Effects>, BakeError> {
-    let Some(weights) = session.finished(stage) else {
-        return Ok(None);
-    };
-    let mut builder = Builder::new();
-    Ok(Some(if paper {
-        let net = PaperEffects::new(&mut builder);
-        let mut params = builder.build(data.device, 0);
-        load_weights(&mut params, weights)?;
-        Effects::Paper(net, params)
-    } else {
-        let net = PointEffects::new(&mut builder);
-        let mut params = builder.build(data.device, 0);
-        load_weights(&mut params, weights)?;
-        Effects::Points(net, params)
-    }))
-}
-
 /// Trains the point effects of preset `standard`.
 pub(crate) fn train_points(
     data: &Dataset<'_>,
@@ -221,34 +196,27 @@ pub(crate) fn train_points(
     let observations = observe_all(data)?;
     let mut builder = Builder::new();
     let net = PointEffects::new(&mut builder);
-    let params = builder.build(data.device, seed);
-    let adam = Adam::new(&params, AVERAGE_DECAY);
+    let trainee = Trainee::new(builder.build(data.device, seed), AVERAGE_DECAY);
     let count = observations.points.size()[0];
     let views = observations.sources.len() as i64;
-    let outcome = session.train(
-        STAGE,
-        vec![Trainee { params, adam }],
+    let stage = Stage {
+        name: STAGE,
         schedule,
-        |trainees, step, fraction, scale| {
-            let trainee = &mut trainees[0];
-            let mut rng = step_rng(seed, STAGE, step);
-            let pick = indices(&mut rng, batch, count, data.device);
-            let other = indices(&mut rng, batch, views, data.device);
-            let Some(loss) = point_loss(&observations, &net, &trainee.params, &pick, &other) else {
-                return 0.0;
-            };
-            let value = loss.double_value(&[]);
-            loss.backward();
-            trainee.adam.step(
-                &mut trainee.params,
-                cosine_rate(POINT_RATE, fraction) * scale,
-                1.0,
-            );
-            value
-        },
-        |_, _, _| Ok(None),
-    )?;
-    session.finish(STAGE, &outcome.best()?)
+        watch: None,
+    };
+    session.train(&stage, vec![trainee], |trainees, step, fraction, scale| {
+        let trainee = &mut trainees[0];
+        let mut rng = step_rng(seed, STAGE, step);
+        let pick = indices(&mut rng, batch, count, data.device);
+        let other = indices(&mut rng, batch, views, data.device);
+        let Some(loss) = point_loss(&observations, &net, &trainee.params, &pick, &other) else {
+            return 0.0;
+        };
+        let value = loss.double_value(&[]);
+        loss.backward();
+        trainee.step(cosine_rate(POINT_RATE, fraction) * scale, 1.0);
+        value
+    })
 }
 
 /// Mean prediction error over the pairs that see each other, plus the sparsity term; `None` when no pair does.
@@ -329,22 +297,20 @@ struct PaperView {
     geometry: Tensor,
     /// [H*W, 3] encoded sRGB.
     colors: Tensor,
-    /// [H*W] 1 on the object.
+    /// [H*W]: 1 on the object.
     mask: Tensor,
-    /// Pixels of `mask` that are 1.
+    /// [P] i64: pixels of `mask` that are 1.
     pixels: Tensor,
     camera: ign_geometry::Camera,
     depth: Vec<f32>,
 }
 
-/// Trains the paper's `EffectsNet`: random image pairs, l2 of the masked difference, 0.01 l1 of the effects, Adam 1e-3.
-///
-/// The paper gives norms without saying how they scale with the number of pixels; here both are means per pixel, so
-/// that their ratio does not depend on the resolution.
+/// Trains the paper's `EffectsNet` on random pairs of images.
 pub(crate) fn train_paper(
     data: &Dataset<'_>,
     session: &mut Session<'_>,
-    stage: &'static str,
+    name: &'static str,
+    settings: &RenderSettings,
     schedule: Schedule,
     seed: u64,
 ) -> Result<(), BakeError> {
@@ -353,7 +319,7 @@ pub(crate) fn train_paper(
         .iter()
         .map(|&view| {
             let straight = data.straight(view, 1)?;
-            let target = Target::new(&data.proxy, &straight.camera, &data.settings, data.device);
+            let target = Target::new(&data.proxy, &straight.camera, settings, data.device);
             let gbuffer = data.proxy.g_buffer(&straight.camera, 1);
             let covered = Tensor::from_slice(&gbuffer.mask).to_kind(Kind::Float);
             let mask = (covered
@@ -380,44 +346,28 @@ pub(crate) fn train_paper(
         .collect::<Result<_, BakeError>>()?;
     let mut builder = Builder::new();
     let net = PaperEffects::new(&mut builder);
-    let params = builder.build(data.device, seed);
-    let adam = Adam::new(&params, 0.0);
-    let outcome = session.train(
-        stage,
-        vec![Trainee { params, adam }],
+    let trainee = Trainee::new(builder.build(data.device, seed), 0.0);
+    let stage = Stage {
+        name,
         schedule,
-        |trainees, step, _, scale| {
-            let trainee = &mut trainees[0];
-            let mut rng = step_rng(seed, stage, step);
-            let p = &views[rng.random_range(0..views.len())];
-            let q = &views[rng.random_range(0..views.len())];
-            let effects = net.forward(
-                &trainee.params,
-                &Tensor::cat(&[&p.geometry, &q.geometry], 0),
-                true,
-            );
-            let flat = |at: i64| effects.select(0, at).view([3, -1]).tr();
-            let diffuse_p = &p.colors - flat(0);
-            let diffuse_q = &q.colors - flat(1);
-            let rows = |t: Tensor| t.view([-1, t.size()[1]]).index_select(0, &p.pixels);
-            let map = p.geometry.view([9, -1]).tr();
-            let sources = Sources::new(&[q.camera], &[q.depth.as_slice()], data.device);
-            let points = rows(map.narrow(1, 0, 3).contiguous());
-            let normals = rows(map.narrow(1, 3, 3).contiguous());
-            let zeros = Tensor::zeros([points.size()[0]], (Kind::Int64, data.device));
-            let taps = sources.taps(&points, &normals, &zeros).weighted(&q.mask);
-            let visible = taps.visibility.gt(0.5).to_kind(Kind::Float).unsqueeze(1);
-            let warped = taps.gather(&diffuse_q) / taps.visibility.clamp_min(1e-3).unsqueeze(1);
-            let loss = losses::diffuse_distance(&rows(diffuse_p), &warped, &visible)
-                + losses::sparsity(&effects) * SPARSITY;
-            let value = loss.double_value(&[]);
-            loss.backward();
-            trainee
-                .adam
-                .step(&mut trainee.params, 1e-3 * scale, f64::INFINITY);
-            value
-        },
-        |_, _, _| Ok(None),
-    )?;
-    session.finish(stage, &outcome.trainees[0].params)
+        watch: None,
+    };
+    session.train(&stage, vec![trainee], |trainees, step, _, scale| {
+        let mut rng = step_rng(seed, name, step);
+        let p = &views[rng.random_range(0..views.len())];
+        let q = &views[rng.random_range(0..views.len())];
+        let map = p.geometry.view([9, -1]).tr().index_select(0, &p.pixels);
+        let sources = Sources::new(&[q.camera], &[q.depth.as_slice()], data.device);
+        let points = map.narrow(1, 0, 3).contiguous();
+        let normals = map.narrow(1, 3, 3).contiguous();
+        let zeros = Tensor::zeros([points.size()[0]], (Kind::Int64, data.device));
+        let pair = SiamesePair {
+            geometry: &Tensor::cat(&[&p.geometry, &q.geometry], 0),
+            color_p: &p.colors,
+            color_q: &q.colors,
+            surface: &p.pixels,
+            taps: &sources.taps(&points, &normals, &zeros).weighted(&q.mask),
+        };
+        steps::effects_step(&net, &mut trainees[0], &pair, steps::RATE * scale)
+    })
 }

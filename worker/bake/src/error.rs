@@ -42,12 +42,15 @@ pub enum BakeError {
     /// The bundle could not be written or did not verify.
     #[error("the bundle could not be packed")]
     Bundle(#[from] BundleError),
-    /// A picture of the bundle could not be encoded.
-    #[error("{file} cannot be encoded")]
+    /// The bundle cannot be rendered.
+    #[error("the bundle cannot be rendered")]
+    Render(#[from] ign_render::RenderError),
+    /// A picture of the bundle could not be encoded or read.
+    #[error("{file} cannot be encoded or read")]
     Picture {
         /// The bundle's file.
         file: &'static str,
-        /// The encoder's reason.
+        /// The codec's reason.
         #[source]
         source: image::ImageError,
     },
@@ -74,6 +77,12 @@ pub enum BakeError {
         /// After how many steps.
         step: u64,
     },
+}
+
+/// Names the file or folder of an input or output error.
+pub(crate) fn io(path: &std::path::Path) -> impl FnOnce(std::io::Error) -> BakeError + use<> {
+    let path = path.to_owned();
+    move |source| BakeError::Io { path, source }
 }
 
 impl BakeError {
@@ -121,6 +130,7 @@ impl BakeError {
             Self::Net(_)
             | Self::Checkpoint { .. }
             | Self::Bundle(_)
+            | Self::Render(_)
             | Self::Picture { .. }
             | Self::Animation { .. }
             | Self::Diverged { .. } => text(FailureKind::Crashed, String::new(), String::new()),

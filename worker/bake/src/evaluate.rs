@@ -19,14 +19,15 @@ pub(crate) struct Row {
 pub(crate) fn score(
     name: &str,
     train_secs: f64,
-    views: &[(String, &Scored)],
+    names: &[String],
+    views: &[Scored],
     render: impl Fn(&Target) -> Tensor,
 ) -> Row {
     let mut per_view = Vec::new();
     let mut images = Vec::new();
     let mut scores: Vec<Scores> = Vec::new();
     let mut millis = Vec::new();
-    for (view, scored) in views {
+    for (view, scored) in names.iter().zip(views) {
         let start = Instant::now();
         let image = render(&scored.target);
         millis.push(start.elapsed().as_secs_f64() * 1e3);

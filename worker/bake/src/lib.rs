@@ -6,19 +6,24 @@
 //! bake resume where it was.
 
 mod checkpoint;
+mod compare;
 mod composition;
 mod data;
+mod divergence;
 mod effects;
 mod error;
 mod evaluate;
+pub mod experiment;
 mod pack;
 mod progress;
 mod recipe;
 mod run;
 mod sampler;
+mod training;
 
 pub use error::BakeError;
-pub use recipe::{Preset, Recipe};
+pub(crate) use error::io;
+pub use recipe::{Crop, Method, Preset, Recipe};
 pub use run::{BakeJob, bake};
 
 pub use ign_events::Event;

@@ -232,17 +232,11 @@ fn canonical_exposure(gains: &[[f32; 3]]) -> CanonicalExposure {
 
 /// The worst views first, then an even spread over the rest.
 fn report_views(views: &[(String, &Scored)], rows: &[Row], model: &Model) -> Vec<ReportView> {
-    let find = |name: &str| rows.iter().find(|row| row.metrics.name == name);
-    let Some(ours) = find("ours") else {
+    let Some(ours) = rows.iter().find(|row| row.metrics.name == "ours") else {
         return Vec::new();
     };
-    let baseline = [find("n_ibr"), find("ibr")]
-        .into_iter()
-        .flatten()
-        .min_by(|a, b| a.metrics.mse.total_cmp(&b.metrics.mse));
-    let Some(baseline) = baseline else {
-        return Vec::new();
-    };
+    let best = rows.iter().filter(|row| row.metrics.is_baseline());
+    let best = best.min_by(|a, b| a.metrics.mse.total_cmp(&b.metrics.mse));
     let mut order: Vec<usize> = (0..views.len()).collect();
     order.sort_by(|&a, &b| {
         ours.metrics.per_view[b]
@@ -274,8 +268,7 @@ fn report_views(views: &[(String, &Scored)], rows: &[Row], model: &Model) -> Vec
                 name: name.clone(),
                 target: to_image(&scored.truth),
                 ours: ours.images[at].clone(),
-                baseline: baseline.images[at].clone(),
-                baseline_name: baseline.metrics.name.clone(),
+                baseline: best.map(|row| (row.metrics.name.clone(), row.images[at].clone())),
                 diffuse,
                 effects,
             }

@@ -36,7 +36,7 @@ impl<'a> Reporter<'a> {
         Self {
             sink,
             state: RefCell::new(State {
-                shares: shares(&[]),
+                shares: shares(0),
                 part: (0.0, 1.0),
                 started: now,
                 first_percent: None,
@@ -49,9 +49,9 @@ impl<'a> Reporter<'a> {
         }
     }
 
-    /// Adds stages that only some bakes have, between `composition` and `evaluate`.
-    pub(crate) fn expect(&self, extra: &[(&'static str, f64)]) {
-        self.state.borrow_mut().shares = shares(extra);
+    /// Expects so many methods to be trained for comparison, between `composition` and `evaluate`.
+    pub(crate) fn expect(&self, methods: usize) {
+        self.state.borrow_mut().shares = shares(methods);
     }
 
     /// Says which part of the stage the next steps are.
@@ -145,7 +145,7 @@ impl<'a> Reporter<'a> {
     }
 }
 
-fn shares(extra: &[(&'static str, f64)]) -> Shares {
+fn shares(methods: usize) -> Shares {
     let before = [
         ("import", 4.0),
         ("plan", 6.0),
@@ -155,7 +155,7 @@ fn shares(extra: &[(&'static str, f64)]) -> Shares {
     let after = [("evaluate", 8.0), ("pack", 4.0)];
     before
         .into_iter()
-        .chain(extra.iter().copied())
+        .chain((methods > 0).then_some(("comparison", 60.0 * methods as f64)))
         .chain(after)
         .collect()
 }

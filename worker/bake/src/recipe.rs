@@ -5,6 +5,9 @@ use std::collections::BTreeMap;
 
 use crate::BakeError;
 
+/// Of a capture.
+const MOST_VIEWS: usize = 1_000_000;
+
 /// Named starting points of a recipe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -61,6 +64,57 @@ impl Default for Recipe {
     }
 }
 
+/// A method that is scored beside ours; its name is a row of metrics.json.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Method {
+    /// One static colour per vertex.
+    VertexColor,
+    /// Static colours as dense as the references' pixels.
+    Texture,
+    /// The mean of the K nearest references.
+    NaiveIbr,
+    /// Debevec 1998: per triangle the best of all references.
+    Ibr,
+    /// Image-to-image translation of position maps.
+    Pix2pixPosition,
+    /// Image-to-image translation of depth maps.
+    Pix2pixDepth,
+    /// Ours without `EffectsNet`.
+    OursNoEffects,
+    /// The paper's networks, losses and schedule, trained for as long as ours.
+    Paper,
+}
+
+impl Method {
+    /// All methods.
+    pub const ALL: [Self; 8] = [
+        Self::VertexColor,
+        Self::Texture,
+        Self::NaiveIbr,
+        Self::Ibr,
+        Self::Pix2pixPosition,
+        Self::Pix2pixDepth,
+        Self::OursNoEffects,
+        Self::Paper,
+    ];
+    /// Those that need no training.
+    pub const CHEAP: [Self; 4] = [Self::VertexColor, Self::Texture, Self::NaiveIbr, Self::Ibr];
+
+    /// Its row of metrics.json.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::VertexColor => "vertex_color",
+            Self::Texture => "texture",
+            Self::NaiveIbr => "n_ibr",
+            Self::Ibr => "ibr",
+            Self::Pix2pixPosition => "pix2pix_position",
+            Self::Pix2pixDepth => "pix2pix_depth",
+            Self::OursNoEffects => "ours_no_effects",
+            Self::Paper => "paper",
+        }
+    }
+}
+
 /// When `EffectsNet` is trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum EffectsChoice {
@@ -80,13 +134,11 @@ pub(crate) enum GainsChoice {
 
 /// The recipe resolved: every number a bake needs.
 #[derive(Clone, Debug)]
-#[expect(
-    clippy::struct_excessive_bools,
-    reason = "each is a switch of the recipe"
-)]
 pub(crate) struct Settings {
     pub(crate) preset: Preset,
     pub(crate) k: usize,
+    /// Training views that are used at most, evenly spread; the others are left out.
+    pub(crate) train_views: usize,
     pub(crate) references: usize,
     pub(crate) supersample: u32,
     pub(crate) effects: EffectsChoice,
@@ -97,8 +149,8 @@ pub(crate) struct Settings {
     /// Windows per step and their side in pixels.
     pub(crate) batch: usize,
     pub(crate) patch: i64,
-    pub(crate) ablate_effects: bool,
-    pub(crate) compare_paper: bool,
+    /// Scored beside ours, in the order of [`Method::ALL`].
+    pub(crate) methods: Vec<Method>,
     pub(crate) half_weights: bool,
     pub(crate) checkpoint_secs: f64,
     pub(crate) margin: f64,
@@ -131,10 +183,13 @@ impl Recipe {
             ));
         }
         let paper = self.preset == Preset::Paper;
-        let epochs = |count: u64| count * train_views as u64;
+        let most = self.settings.get("train_views");
+        let most = most.map_or(Ok(MOST_VIEWS), |value| train_views_setting(value))?;
+        let epochs = |count: u64| count * train_views.min(most) as u64;
         let mut settings = Settings {
             preset: self.preset,
             k: 4,
+            train_views: MOST_VIEWS,
             references: 20,
             supersample: if paper { 1 } else { 2 },
             effects: if paper {
@@ -147,8 +202,7 @@ impl Recipe {
             composition_steps: if paper { epochs(64) } else { 1000 },
             batch: 4,
             patch: 64,
-            ablate_effects: true,
-            compare_paper: false,
+            methods: Method::CHEAP.to_vec(),
             half_weights: false,
             checkpoint_secs: 20.0,
             margin: 0.05,
@@ -159,14 +213,32 @@ impl Recipe {
         for (key, value) in &self.settings {
             settings.set(key, value)?;
         }
+        if paper && settings.compares(Method::Paper) {
+            return Err(invalid(
+                "preset paper cannot be compared with itself".into(),
+                "leave paper out of methods: it is the row of ours",
+            ));
+        }
         Ok(settings)
     }
 }
 
 impl Settings {
+    /// Number of methods that train beside ours.
+    pub(crate) fn trained_methods(&self) -> usize {
+        let cheap = |method: &&Method| !Method::CHEAP.contains(method);
+        self.methods.iter().filter(cheap).count()
+    }
+
+    /// Whether `method` is scored beside ours.
+    pub(crate) fn compares(&self, method: Method) -> bool {
+        self.methods.contains(&method)
+    }
+
     fn set(&mut self, key: &str, value: &str) -> Result<(), BakeError> {
         match key {
             "k" => self.k = number(key, value, 1, 16)?,
+            "train_views" => self.train_views = train_views_setting(value)?,
             "references" => self.references = number(key, value, 1, 64)?,
             "supersample" => self.supersample = number(key, value, 1, 4)?,
             "effects" => {
@@ -199,8 +271,7 @@ impl Settings {
             "composition_steps" => self.composition_steps = number(key, value, 1, 10_000_000)?,
             "batch" => self.batch = number(key, value, 1, 256)?,
             "patch" => self.patch = number(key, value, 16, 4096)?,
-            "ablate_effects" => self.ablate_effects = switch(key, value)?,
-            "compare_paper" => self.compare_paper = switch(key, value)?,
+            "methods" => self.methods = methods(value)?,
             "half_weights" => self.half_weights = switch(key, value)?,
             "checkpoint_secs" => self.checkpoint_secs = number(key, value, 0.0, 86_400.0)?,
             "margin" => self.margin = number(key, value, 0.0, 2.0)?,
@@ -209,8 +280,8 @@ impl Settings {
             _ => {
                 return Err(invalid(
                     format!("setting {key} is unknown"),
-                    "known: k, references, supersample, effects, effects_steps, effects_batch, composition_steps, \
-                     batch, patch, ablate_effects, compare_paper, half_weights, checkpoint_secs, margin, gains, simplify, preview_frames",
+                    "known: k, train_views, references, supersample, effects, effects_steps, effects_batch, composition_steps, \
+                     batch, patch, methods, half_weights, checkpoint_secs, margin, gains, simplify, preview_frames",
                 ));
             }
         }
@@ -223,6 +294,32 @@ fn invalid(message: String, hint: &str) -> BakeError {
         message,
         hint: hint.into(),
     }
+}
+
+fn train_views_setting(value: &str) -> Result<usize, BakeError> {
+    number("train_views", value, 2, MOST_VIEWS)
+}
+
+/// Names separated by commas; `none` is no method.
+fn methods(value: &str) -> Result<Vec<Method>, BakeError> {
+    let mut chosen = Vec::new();
+    for name in value
+        .split(',')
+        .map(str::trim)
+        .filter(|name| *name != "none")
+    {
+        let method = Method::ALL.into_iter().find(|method| method.name() == name);
+        chosen.push(method.ok_or_else(|| {
+            let known: Vec<&str> = Method::ALL.into_iter().map(Method::name).collect();
+            invalid(
+                format!("method {name:?} is unknown"),
+                &format!("known: {}; or none", known.join(", ")),
+            )
+        })?);
+    }
+    chosen.sort_unstable();
+    chosen.dedup();
+    Ok(chosen)
 }
 
 fn number<T: Copy + std::str::FromStr + PartialOrd + std::fmt::Display>(
@@ -267,6 +364,8 @@ mod tests {
             ("effects", "maybe"),
             ("gains", "on"),
             ("margin", "NaN"),
+            ("methods", "ibr,texure"),
+            ("methods", ""),
         ] {
             let mut recipe = Recipe::default();
             recipe.settings.insert(key.into(), value.into());
@@ -294,6 +393,38 @@ mod tests {
     }
 
     #[test]
+    fn methods_are_chosen_by_name() {
+        let with = |preset, value: &str| {
+            let mut recipe = Recipe {
+                preset,
+                ..Recipe::default()
+            };
+            recipe.settings.insert("methods".into(), value.into());
+            recipe.resolve(10)
+        };
+        let all: Vec<&str> = Method::ALL.into_iter().map(Method::name).collect();
+        let all = with(Preset::Standard, &all.join(", ")).expect("valid");
+        assert_eq!(all.methods, Method::ALL);
+        let two = with(Preset::Paper, "ibr,n_ibr,ibr").expect("valid");
+        assert_eq!(two.methods, [Method::NaiveIbr, Method::Ibr]);
+        assert!(
+            with(Preset::Standard, "none")
+                .expect("valid")
+                .methods
+                .is_empty()
+        );
+        assert!(with(Preset::Paper, "paper").is_err());
+        let Err(BakeError::Recipe { message, hint }) = with(Preset::Standard, "texure") else {
+            panic!("an unknown method is taken");
+        };
+        assert!(message.contains("texure"), "{message}");
+        assert!(
+            Method::ALL.iter().all(|m| hint.contains(m.name())),
+            "{hint}"
+        );
+    }
+
+    #[test]
     fn the_paper_preset_is_the_papers() {
         let settings = Recipe {
             preset: Preset::Paper,
@@ -304,6 +435,12 @@ mod tests {
         assert_eq!((settings.k, settings.references), (4, 20));
         assert_eq!(settings.effects_steps, 6400);
         assert_eq!(settings.composition_steps, 6400);
+        let mut halved = Recipe {
+            preset: Preset::Paper,
+            ..Recipe::default()
+        };
+        halved.settings.insert("train_views".into(), "50".into());
+        assert_eq!(halved.resolve(100).expect("valid").effects_steps, 3200);
     }
 
     #[test]

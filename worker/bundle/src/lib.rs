@@ -19,7 +19,7 @@ pub mod weights;
 pub use error::BundleError;
 pub use manifest::{Manifest, NetworkDescription};
 pub use metrics::Metrics;
-pub use pack::{Bundle, BundleWriter};
+pub use pack::{Bundle, BundleWriter, folder_digest};
 pub use paths::held_out_file;
 pub use references::{HeldOutView, Reference};
 pub use report::{CaptureLine, ReportInput, ReportView, render_report};

@@ -156,6 +156,11 @@ impl Scores {
 }
 
 impl MethodMetrics {
+    /// Whether this is somebody else's method: neither ours nor a variant of it.
+    pub fn is_baseline(&self) -> bool {
+        !self.name.starts_with("ours") && self.name != "paper"
+    }
+
     /// Averages the scores of all held-out views. With no view at all every error is 0 and the worst view is "".
     pub fn from_views(
         name: &str,
@@ -205,7 +210,7 @@ impl Metrics {
     pub fn best_baseline(&self) -> Option<&MethodMetrics> {
         self.methods
             .iter()
-            .filter(|m| !m.name.starts_with("ours") && m.name != "paper")
+            .filter(|m| m.is_baseline())
             .min_by(|a, b| a.mse.total_cmp(&b.mse))
     }
 

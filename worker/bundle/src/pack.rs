@@ -393,6 +393,19 @@ fn digest(dir: &Path, path: &str) -> Result<(String, u64), BundleError> {
     Ok((hex::encode(hasher.0.finalize()), size))
 }
 
+/// `sha256:<hex>` of the names and contents of all files below `dir`, in the order of their names.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn folder_digest(dir: &Path) -> Result<String, BundleError> {
+    let mut all = Sha256::new();
+    for path in list_files(dir)? {
+        let (sha256, _) = digest(dir, &path)?;
+        all.update(format!("{sha256}  {path}\n"));
+    }
+    Ok(format!("sha256:{}", hex::encode(all.finalize())))
+}
+
 struct HashWriter(Sha256);
 
 impl Write for HashWriter {

@@ -19,7 +19,7 @@ use crate::metrics::MethodMetrics;
 
 mod collection;
 mod pictures;
-mod plot;
+pub mod plot;
 mod verdict;
 
 pub use collection::{
@@ -68,10 +68,8 @@ pub struct ReportView {
     pub target: RgbImage,
     /// Our rendering.
     pub ours: RgbImage,
-    /// The best other method's rendering.
-    pub baseline: RgbImage,
-    /// Its name, as in `metrics.json`.
-    pub baseline_name: String,
+    /// The best other method's name, as in `metrics.json`, and its rendering.
+    pub baseline: Option<(String, RgbImage)>,
     /// Estimated diffuse image, where effects were learned.
     pub diffuse: Option<RgbImage>,
     /// Estimated view-dependent effects, where they were learned.
@@ -178,17 +176,17 @@ fn pictures_section(input: &ReportInput<'_>) -> String {
         .views
         .iter()
         .map(|view| {
-            let baseline = method_label(&view.baseline_name);
-            let mut figures = vec![
-                figure(&view.target, "photograph"),
-                figure(&view.ours, "ours"),
-                figure(&view.baseline, &baseline),
-                figure(&scale.map(&view.ours, &view.target), "error, ours"),
-                figure(
-                    &scale.map(&view.baseline, &view.target),
-                    &format!("error, {baseline}"),
-                ),
-            ];
+            let mut methods = vec![("ours", "ours".to_owned(), &view.ours)];
+            methods.extend(
+                view.baseline
+                    .as_ref()
+                    .map(|(name, image)| (name.as_str(), method_label(name), image)),
+            );
+            let mut figures = vec![figure(&view.target, "photograph")];
+            figures.extend(methods.iter().map(|(_, label, image)| figure(image, label)));
+            figures.extend(methods.iter().map(|(_, label, image)| {
+                figure(&scale.map(image, &view.target), &format!("error, {label}"))
+            }));
             figures.extend(
                 view.diffuse
                     .as_ref()
@@ -203,22 +201,19 @@ fn pictures_section(input: &ReportInput<'_>) -> String {
                 .metrics
                 .method("ours")
                 .is_some_and(|ours| ours.worst_view.name == view.name);
-            let per_method = [
-                ("ours", "ours"),
-                (view.baseline_name.as_str(), baseline.as_str()),
-            ]
-            .iter()
-            .filter_map(|(name, label)| {
-                let row = input
-                    .metrics
-                    .method(name)?
-                    .per_view
-                    .iter()
-                    .find(|v| v.name == view.name)?;
-                Some(format!("{label} {}", significant(row.mse)))
-            })
-            .collect::<Vec<_>>()
-            .join(", ");
+            let per_method = methods
+                .iter()
+                .filter_map(|(name, label, _)| {
+                    let row = input
+                        .metrics
+                        .method(name)?
+                        .per_view
+                        .iter()
+                        .find(|v| v.name == view.name)?;
+                    Some(format!("{label} {}", significant(row.mse)))
+                })
+                .collect::<Vec<_>>()
+                .join(", ");
             format!(
                 "<article><h3>{}{}</h3><p class=\"note\">mean squared error: {per_method}</p>\
                  <div class=\"pictures\">{}</div></article>",
@@ -492,7 +487,7 @@ fn provenance_section(input: &ReportInput<'_>) -> String {
 }
 
 /// A method's name for people.
-fn method_label(name: &str) -> String {
+pub fn method_label(name: &str) -> String {
     match name {
         "ours" => "ours",
         "ours_no_effects" => "ours without effects",

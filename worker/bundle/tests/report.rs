@@ -46,8 +46,7 @@ fn views() -> Vec<ReportView> {
                 name: format!("{:04}.png", 7 + 8 * i),
                 target: ball(turn, gloss, 0.0),
                 ours: ball(turn, gloss * if i == 1 { 0.6 } else { 0.93 }, 0.0),
-                baseline: ball(turn, 0.1, 1.5),
-                baseline_name: "ibr".into(),
+                baseline: Some(("ibr".into(), ball(turn, 0.1, 1.5))),
                 diffuse: Some(ball(turn, 0.0, 0.0)),
                 effects: (i < 2).then(|| {
                     let (mut image, diffuse) = (ball(turn, gloss, 0.0), ball(turn, 0.0, 0.0));

@@ -84,6 +84,8 @@ pub struct DemoOptions {
     pub views: usize,
     /// How many of them are held out; an eighth of them when `None`.
     pub held_out: Option<usize>,
+    /// Holds out so many frames of one round about the object, beside the views, in place of some of the views.
+    pub orbit: Option<usize>,
     /// Varies the painting and the camera path.
     pub seed: u64,
     /// The object turns in front of the lamps and the camera moves only up, down and nearer: seen from the object, the
@@ -99,6 +101,7 @@ impl Default for DemoOptions {
             size: 160,
             views: 96,
             held_out: None,
+            orbit: None,
             seed: 0,
             turntable: false,
         }
@@ -110,8 +113,12 @@ const LARGEST_SIZE: u32 = 4096;
 const MOST_VIEWS: usize = 10_000;
 
 impl DemoOptions {
+    /// Views of the spiral that are held out.
     fn held_out_count(&self) -> usize {
-        self.held_out.unwrap_or((self.views / 8).max(1))
+        match self.orbit {
+            Some(_) => 0,
+            None => self.held_out.unwrap_or((self.views / 8).max(1)),
+        }
     }
 
     fn check(&self) -> Result<(), DemoError> {
@@ -130,6 +137,16 @@ impl DemoOptions {
                 "views is {}, expected 3 to {MOST_VIEWS}",
                 self.views
             ));
+        }
+        if let Some(frames) = self.orbit {
+            if !(2..=MOST_VIEWS).contains(&frames) {
+                return refuse(format!(
+                    "orbit is {frames}, expected 2 to {MOST_VIEWS} frames"
+                ));
+            }
+            if self.held_out.is_some() || self.turntable {
+                return refuse("an orbit is held out by itself, under constant light".into());
+            }
         }
         if self.held_out_count() + 2 > self.views {
             return refuse(format!(
@@ -218,7 +235,8 @@ pub fn generate(
     let paint = Paint::new(options.shape, options.seed);
     let tracer = Tracer::new(&surface);
     let lighting = Lighting::bake(&surface, &tracer);
-    let views = path::spiral(options, surface.center)?;
+    let mut views = path::spiral(options, surface.center)?;
+    views.extend(path::orbit(options, surface.center)?);
 
     write::folders(&staging.dir)?;
     let colors = write::vertex_colors(&surface, &paint, &lighting);

@@ -23,6 +23,9 @@ const FOCAL: f64 = 1.72;
 /// The principal point, off centre on purpose, as a share of the width and height.
 const PRINCIPAL_POINT: (f64, f64) = (0.4785, 0.5137);
 
+/// Elevation of an orbit, degrees: in the middle of what the spiral covers.
+const ORBIT_ELEVATION: f64 = 22.0;
+
 /// One view to render.
 pub(crate) struct DemoView {
     /// Stem of its files.
@@ -31,19 +34,53 @@ pub(crate) struct DemoView {
     pub(crate) held_out: bool,
 }
 
-/// All views, in path order.
-pub(crate) fn spiral(options: &DemoOptions, center: DVec3) -> Result<Vec<DemoView>, DemoError> {
-    let mut rng = Pcg32::seed_from_u64(options.seed ^ 0x7061_7468);
-    let start = rng.random_range(0.0..TAU);
+fn intrinsics(options: &DemoOptions) -> CameraIntrinsics {
     let size = f64::from(options.size);
-    let intrinsics = CameraIntrinsics {
+    CameraIntrinsics {
         fx: FOCAL * size,
         fy: FOCAL * size,
         cx: PRINCIPAL_POINT.0 * size,
         cy: PRINCIPAL_POINT.1 * size,
         width: options.size,
         height: options.size,
-    };
+    }
+}
+
+/// From the object's middle; angles in radians.
+fn direction(azimuth: f64, elevation: f64) -> DVec3 {
+    DVec3::new(
+        elevation.cos() * azimuth.cos(),
+        elevation.cos() * azimuth.sin(),
+        elevation.sin(),
+    )
+}
+
+/// The held-out frames of one round, if there are to be any.
+pub(crate) fn orbit(options: &DemoOptions, center: DVec3) -> Result<Vec<DemoView>, DemoError> {
+    let frames = options.orbit.unwrap_or(0);
+    (0..frames)
+        .map(|index| {
+            let azimuth = TAU * index as f64 / frames as f64;
+            let outwards = direction(azimuth, ORBIT_ELEVATION.to_radians());
+            let eye = center + outwards * DISTANCE;
+            let camera = Camera::look_at(intrinsics(options), eye, center, DVec3::Z);
+            Ok(DemoView {
+                stem: format!("orbit_{index:04}"),
+                camera: camera.map_err(|source| DemoError::Camera {
+                    view: index,
+                    source,
+                })?,
+                held_out: true,
+            })
+        })
+        .collect()
+}
+
+/// All views of the spiral, in path order.
+pub(crate) fn spiral(options: &DemoOptions, center: DVec3) -> Result<Vec<DemoView>, DemoError> {
+    let mut rng = Pcg32::seed_from_u64(options.seed ^ 0x7061_7468);
+    let start = rng.random_range(0.0..TAU);
+    let intrinsics = intrinsics(options);
     let held_out = options.held_out_count();
     let mut views = Vec::with_capacity(options.views);
     for index in 0..options.views {
@@ -55,11 +92,7 @@ pub(crate) fn spiral(options: &DemoOptions, center: DVec3) -> Result<Vec<DemoVie
         let azimuth = start + TAU * ROUNDS * along;
         let distance = DISTANCE * (1.0 + rng.random_range(-DISTANCE_VARIES..DISTANCE_VARIES));
         let roll = rng.random_range(-ROLL_VARIES..ROLL_VARIES);
-        let outwards = DVec3::new(
-            elevation.cos() * azimuth.cos(),
-            elevation.cos() * azimuth.sin(),
-            elevation.sin(),
-        );
+        let outwards = direction(azimuth, elevation);
         let side = DVec3::new(-azimuth.sin(), azimuth.cos(), 0.0);
         let up = DVec3::Z * roll.cos() + side * roll.sin();
         let camera = Camera::look_at(intrinsics, center + outwards * distance, center, up)

@@ -252,3 +252,29 @@ fn occupied_folders_and_bad_options_are_refused() {
     .expect("a capture");
     assert_eq!(last.get(), (10, 10));
 }
+
+#[test]
+fn an_orbit_is_held_out_beside_the_views() {
+    let (_keep, out) = generated(&DemoOptions {
+        size: 24,
+        views: 4,
+        held_out: None,
+        orbit: Some(3),
+        ..DemoOptions::default()
+    });
+    let held_out = fs::read_to_string(out.join("test.txt")).expect("a list");
+    let names: Vec<&str> = held_out.lines().collect();
+    assert_eq!(
+        names,
+        ["orbit_0000.png", "orbit_0001.png", "orbit_0002.png"]
+    );
+    let images = fs::read_dir(out.join("images")).expect("images").count();
+    assert_eq!(images, 7);
+    let pair = DemoOptions {
+        orbit: Some(3),
+        held_out: Some(2),
+        ..DemoOptions::default()
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    assert!(generate(&folder.path().join("x"), &pair, &|_, _| {}).is_err());
+}

@@ -16,7 +16,8 @@ use tch::{Kind, Tensor};
 const KEEP: Option<Kind> = None;
 const PAPER_WIDTHS: [i64; 6] = [64, 64, 128, 128, 256, 256];
 
-/// The paper's `CompositionNet`: input 3K warped colours, 2K warp fields, 3 target positions.
+/// The paper's `CompositionNet`: input 3K warped colours, 2K warp fields, 3 target positions. With other inputs it is the
+/// generator of the image-to-image baselines (Pix2Pix).
 #[derive(Debug)]
 pub struct PaperComposition {
     net: UNet,
@@ -28,9 +29,8 @@ impl PaperComposition {
         5 * k as i64 + 3
     }
 
-    /// Registers the network's tensors.
-    pub fn new(builder: &mut Builder, k: usize) -> Self {
-        let input = Self::input_channels(k);
+    /// Registers the network's tensors for an input of so many channels.
+    pub fn new(builder: &mut Builder, input: i64) -> Self {
         Self {
             net: builder.scope("composition", |b| {
                 UNet::new(b, input, &PAPER_WIDTHS, 3, 0.2)
@@ -38,7 +38,7 @@ impl PaperComposition {
         }
     }
 
-    /// input: [B, 5K + 3, H, W] -> [B, 3, H, W], encoded sRGB in [0, 1].
+    /// input: [B, C, H, W] -> [B, 3, H, W], encoded sRGB in [0, 1].
     pub fn forward(&self, params: &Params, input: &Tensor, train: bool) -> Tensor {
         self.net.forward(params, input, train).sigmoid()
     }

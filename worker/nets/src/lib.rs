@@ -13,6 +13,7 @@ pub mod losses;
 pub mod optim;
 pub mod params;
 pub mod patchgan;
+pub mod steps;
 pub mod unet;
 pub mod warp;
 

@@ -30,6 +30,28 @@ pub struct AdamState {
     pub steps: u64,
 }
 
+/// A network in training: its tensors and their optimiser.
+#[derive(Debug)]
+pub struct Trainee {
+    /// The network's tensors.
+    pub params: Params,
+    /// Their optimiser.
+    pub adam: Adam,
+}
+
+impl Trainee {
+    /// A network at the start of its training; see [`Adam::new`].
+    pub fn new(params: Params, average_decay: f64) -> Self {
+        let adam = Adam::new(&params, average_decay);
+        Self { params, adam }
+    }
+
+    /// See [`Adam::step`].
+    pub fn step(&mut self, rate: f64, max_norm: f64) -> bool {
+        self.adam.step(&mut self.params, rate, max_norm)
+    }
+}
+
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;

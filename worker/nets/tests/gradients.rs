@@ -333,7 +333,7 @@ fn of_the_networks() {
     });
     let stack = random(&[1, PaperComposition::input_channels(2), 64, 64]);
     let mut builder = Builder::new();
-    let net = PaperComposition::new(&mut builder, 2);
+    let net = PaperComposition::new(&mut builder, PaperComposition::input_channels(2));
     let params = builder.build(Device::Cpu, 6);
     check_params("the paper's CompositionNet", &params, 12, &|params| {
         mse(&net.forward(params, &stack, true), &wanted)

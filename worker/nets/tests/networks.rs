@@ -17,7 +17,13 @@ fn parameter_counts_are_the_papers() {
     };
     let close = |count: f64, expected: f64| (count / expected - 1.0).abs() < 0.01;
     assert!(close(count(&|b| drop(PaperEffects::new(b))), 6.35e6));
-    assert!(close(count(&|b| drop(PaperComposition::new(b, 4))), 5.2e6));
+    assert!(close(
+        count(&|b| drop(PaperComposition::new(
+            b,
+            PaperComposition::input_channels(4)
+        ))),
+        5.2e6
+    ));
     assert!(close(count(&|b| drop(PatchGan::new(b, 26))), 2.79e6));
 }
 
@@ -25,7 +31,7 @@ fn parameter_counts_are_the_papers() {
 fn paper_networks_take_any_size() {
     tch::manual_seed(1);
     let mut builder = Builder::new();
-    let net = PaperComposition::new(&mut builder, 4);
+    let net = PaperComposition::new(&mut builder, PaperComposition::input_channels(4));
     let params = builder.build(Device::Cpu, 3);
     for (h, w) in [(64, 64), (70, 101), (17, 33)] {
         let out = no_grad(|| net.forward(&params, &Tensor::rand([1, 23, h, w], CPU), false));

@@ -272,6 +272,12 @@ impl BundleRenderer {
         crate::to_image(&self.model.image(&target))
     }
 
+    /// The estimated diffuse image of one view; `camera` is in the normalised frame.
+    pub fn diffuse_normalised(&self, camera: &Camera) -> RgbImage {
+        let target = Target::new(&self.proxy, camera, &self.model.settings, self.device);
+        crate::to_image(&self.model.diffuse_image(&target))
+    }
+
     /// The camera of a reference view or of a held-out view, normalised frame.
     ///
     /// # Errors
@@ -373,7 +379,7 @@ fn load_composition(
     let mut builder = Builder::new();
     match network.kind.as_str() {
         PAPER_COMPOSITION => {
-            let net = PaperComposition::new(&mut builder, k);
+            let net = PaperComposition::new(&mut builder, PaperComposition::input_channels(k));
             Ok(Composition::Paper(
                 net,
                 filled(builder, bundle, network, device)?,

@@ -10,14 +10,18 @@ mod bundle;
 mod model;
 mod references;
 mod settings;
+mod surface_colors;
 mod target;
+mod translation;
 
 pub use baselines::{debevec_ibr, naive_ibr};
 pub use bundle::{BundleRenderer, NetworkFiles, RenderError, orbit};
 pub use model::{Composition, Effects, Model};
 pub use references::{ReferenceImage, References, Warped};
 pub use settings::{CoverageRule, Recipe, RenderSettings};
-pub use target::Target;
+pub use surface_colors::{ColorGrid, SurfaceColors};
+pub use target::{COVERAGE_CELLS, Target};
+pub use translation::{Translation, TranslationInput};
 
 use image::RgbImage;
 use tch::Tensor;

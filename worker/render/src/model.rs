@@ -133,9 +133,7 @@ impl Model {
             let seen = warped.visibility.gt(0.0).to_kind(Kind::Float).unsqueeze(2);
             warped.color = match &self.effects {
                 None => warped.color,
-                Some(Effects::Paper(..)) => {
-                    (warped.color + effects.unsqueeze(1)).clamp(0.0, 1.0) * seen
-                }
+                Some(Effects::Paper(..)) => (warped.color + effects.unsqueeze(1)) * seen,
                 Some(Effects::Points(..)) => {
                     color::srgb_from_linear(&(warped.color + effects.unsqueeze(1))).clamp(0.0, 1.0)
                         * seen

@@ -1,5 +1,6 @@
 //! The fixed reference views: their pictures, depth from the proxy, and the cross-projection into a target.
 
+use glam::{DVec3, Vec3};
 use ign_geometry::{Camera, Drawable, GBuffer, select};
 use ign_nets::warp::{Sources, directions};
 use tch::{Device, Kind, Tensor};
@@ -77,6 +78,8 @@ impl References {
             (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for image in images {
             let gbuffer = proxy.g_buffer(&image.camera, 4);
+            let normals = recipe.normals(&gbuffer);
+            let eye = image.camera.center();
             let (iw, ih) = (gbuffer.width as usize, gbuffer.height as usize);
             let mut depth = vec![0.0f32; (h * w) as usize];
             let mut color = vec![0.0f32; (h * w * 3) as usize];
@@ -88,12 +91,13 @@ impl References {
                     let to = y * w as usize + x;
                     if gbuffer.mask[from] {
                         depth[to] = gbuffer.depth[from];
-                        let values = gbuffer.position[from]
-                            .iter()
-                            .chain(&recipe.normals(&gbuffer)[from])
-                            .chain(&gbuffer.reflection[from]);
+                        let (position, normal) = (gbuffer.position[from], normals[from]);
+                        let values = position
+                            .into_iter()
+                            .chain(normal)
+                            .chain(reflection(eye, position, normal));
                         for (channel, value) in values.enumerate() {
-                            maps[channel * (h * w) as usize + to] = *value;
+                            maps[channel * (h * w) as usize + to] = value;
                         }
                     }
                     for channel in 0..3 {
@@ -211,6 +215,13 @@ impl References {
             prior,
         }
     }
+}
+
+/// The direction towards `eye`, mirrored about the normal.
+fn reflection(eye: DVec3, position: [f32; 3], normal: [f32; 3]) -> [f32; 3] {
+    let (position, normal) = (Vec3::from(position), Vec3::from(normal));
+    let to_viewer = (eye - position.as_dvec3()).normalize_or_zero().as_vec3();
+    (2.0 * to_viewer.dot(normal) * normal - to_viewer).to_array()
 }
 
 /// The same view at the size on which views are chosen.

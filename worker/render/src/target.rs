@@ -10,6 +10,9 @@ use crate::settings::{CoverageRule, RenderSettings};
 /// Coverage samples per side of one sub-sample cell: 4 x 4 within each cell of a supersampled pixel.
 const CELL_SAMPLES: u32 = 4;
 
+/// Cells per pixel side, at least, whose coverage is taken apart.
+pub const COVERAGE_CELLS: u32 = 2;
+
 /// What the proxy looks like from one camera. All tensors are in the normalised frame, on one device.
 #[derive(Debug)]
 pub struct Target {
@@ -81,19 +84,17 @@ impl Target {
         let to_viewer = ign_nets::warp::directions(&center, &points);
         let total = Tensor::zeros([h * w], (Kind::Float, device)).index_add(0, &pixel, &weight);
 
-        let cells = Tensor::from_slice(&gbuffer.coverage)
-            .view([1, 1, h * i64::from(s), w * i64::from(s)])
+        // Coverage does not depend on how finely references are sampled: methods that differ in that share it.
+        let c = s.max(COVERAGE_CELLS);
+        let finer = (c > s).then(|| {
+            let intrinsics = camera.intrinsics.resized(width * c, height * c);
+            proxy.g_buffer(&camera.with_intrinsics(intrinsics), CELL_SAMPLES)
+        });
+        let c = i64::from(c);
+        let cells = Tensor::from_slice(&finer.as_ref().unwrap_or(&gbuffer).coverage)
+            .view([1, 1, h * c, w * c])
             .to_device(device);
-        let pool = |t: &Tensor| {
-            t.avg_pool2d(
-                [i64::from(s)],
-                [i64::from(s)],
-                [0],
-                false,
-                true,
-                None::<i64>,
-            )
-        };
+        let pool = |t: &Tensor| t.avg_pool2d([c], [c], [0], false, true, None::<i64>);
         let encode = |t: &Tensor| color::srgb_from_linear(t).clamp(0.0, 1.0);
         let coverage = match settings.coverage {
             CoverageRule::Fraction => pool(&cells),

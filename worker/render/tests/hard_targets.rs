@@ -6,8 +6,8 @@ use ign_nets::Builder;
 use ign_nets::composition::{BlendComposition, PaperComposition};
 use ign_nets::effects::{PaperEffects, PointEffects};
 use ign_render::{
-    Composition, Effects, Model, Recipe, ReferenceImage, References, RenderSettings, Target,
-    debevec_ibr, naive_ibr,
+    ColorGrid, Composition, Effects, Model, Recipe, ReferenceImage, References, RenderSettings,
+    SurfaceColors, Target, debevec_ibr, naive_ibr,
 };
 use ign_scenes::hard;
 use tch::{Device, Tensor, no_grad};
@@ -63,7 +63,8 @@ fn model(mesh: &Mesh, images: &[ReferenceImage], recipe: Recipe) -> Model {
     let (effects, composition) = match recipe {
         Recipe::Paper => {
             let effects = PaperEffects::new(&mut first);
-            let net = PaperComposition::new(&mut second, settings.k);
+            let net =
+                PaperComposition::new(&mut second, PaperComposition::input_channels(settings.k));
             (
                 Effects::Paper(effects, first.build(Device::Cpu, 1)),
                 Composition::Paper(net, second.build(Device::Cpu, 2)),
@@ -120,6 +121,8 @@ fn every_target_from_every_reference_set_is_finite_and_bounded() {
             let model = model(&mesh, &images, recipe);
             // The paper's U-Nets take seconds for all sets; their input is what differs.
             let every = recipe == Recipe::Standard || set == "five views";
+            let grids = [ColorGrid::Vertices, ColorGrid::Texels];
+            let surfaces = grids.map(|grid| SurfaceColors::new(&mesh, &model.references, grid));
             for (view, camera) in hard::cameras() {
                 let what = format!("{recipe:?}, {set}, {view}");
                 let target = Target::new(&proxy, &camera, &model.settings, Device::Cpu);
@@ -157,6 +160,9 @@ fn every_target_from_every_reference_set_is_finite_and_bounded() {
                     &debevec_ibr(&model.references, &mesh, &target),
                     &target,
                 );
+                for surface in &surfaces {
+                    assert_image(&what, &surface.image(&mesh, &target), &target);
+                }
             }
         }
     }
@@ -206,9 +212,11 @@ fn damaged_meshes_render_within_bounds() {
     let images = &reference_sets()[0].1;
     for (what, mesh) in hard::damaged_meshes(8, 12) {
         let model = model(&mesh, images, Recipe::Standard);
+        let surface = SurfaceColors::new(&mesh, &model.references, ColorGrid::Texels);
         for camera in [hard::ordinary(), hard::ring()[1]] {
             let target = Target::new(&Drawable::new(&mesh), &camera, &model.settings, Device::Cpu);
             assert_image(what, &model.image(&target), &target);
+            assert_image(what, &surface.image(&mesh, &target), &target);
             assert_image(
                 what,
                 &debevec_ibr(&model.references, &mesh, &target),

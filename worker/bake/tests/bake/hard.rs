@@ -134,7 +134,7 @@ fn georeferenced_and_odd_scales_give_the_same_images() {
     let bake_at = |name: &str, scale: f64, offset: DVec3| {
         let folder = dir.path().join(name);
         let placed = placed(&original, &folder.join("capture"), scale, offset);
-        let recipe = recipe(&[("effects", "on"), ("ablate_effects", "off")]);
+        let recipe = recipe(&[("effects", "on")]);
         renderings(&bake(&job(&placed, &folder.join("work"), recipe), &|_| {}).expect("a bake"))
     };
     let expected = bake_at("recentred", 1.0, DVec3::ZERO);

@@ -1,6 +1,7 @@
 //! Whole bakes of tiny captures: the bundle renders what was scored, a resumed bake ends like an unbroken one, bad
 //! settings and hard captures end as they must.
 
+mod experiments;
 mod gains;
 mod hard;
 
@@ -66,6 +67,43 @@ fn weights(bundle: &Path) -> Vec<Vec<u8>> {
         .collect()
 }
 
+/// What a bake would ship at any second starts at plain image-based rendering and is never worse, by more than the noise of
+/// choosing on other views than those that are scored.
+#[test]
+fn standard_is_never_worse_than_plain_blending() {
+    const NOISE: f64 = 1.03;
+    let dir = tempfile::tempdir().expect("a folder");
+    for (name, gloss) in [("matte", 0.0), ("glossy", 0.9)] {
+        let folder = dir.path().join(name);
+        let capture = capture(&folder, gloss);
+        let recipe = recipe(&[("effects_steps", "60"), ("composition_steps", "40")]);
+        let bundle = bake(&job(&capture, &folder.join("work"), recipe), &|_| {}).expect("a bake");
+        let bundle = Bundle::open(&bundle).expect("it verifies");
+        let metrics = bundle.metrics().expect("metrics").expect("metrics.json");
+        let ours = metrics.speed_error.iter().filter(|p| p.method == "ours");
+        let curve: Vec<(f64, f64)> = ours.map(|p| (p.secs, p.mse)).collect();
+        assert!(curve.len() > 8, "{name}: {curve:?}");
+        assert!(
+            curve.windows(2).all(|pair| pair[0].0 <= pair[1].0),
+            "{name}: {curve:?}"
+        );
+        let (secs, start) = curve[0];
+        assert_eq!(secs.to_bits(), 0.0_f64.to_bits(), "{name}");
+        assert!(
+            curve.iter().all(|(_, mse)| *mse <= NOISE * start),
+            "{name}: {curve:?}"
+        );
+        // The start is the mean of the same views as n_ibr, weighted.
+        let plain = metrics.method("n_ibr").expect("a row").mse;
+        assert!(start < 1.1 * plain, "{name}: {start}, n_ibr {plain}");
+        let end = metrics.method("ours").expect("a row").mse;
+        assert!(
+            end <= NOISE * start,
+            "{name}: ends at {end}, starts at {start}"
+        );
+    }
+}
+
 #[test]
 fn a_bundle_renders_what_was_scored() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -83,7 +121,7 @@ fn a_bundle_renders_what_was_scored() {
         let folder = bake(&job(&capture, &dir.path().join(name), recipe), &|_| {}).expect("a bake");
         let bundle = Bundle::open(&folder).expect("it verifies");
         let metrics = bundle.metrics().expect("metrics").expect("metrics.json");
-        for method in ["n_ibr", "ibr", "ours"] {
+        for method in ["vertex_color", "texture", "n_ibr", "ibr", "ours"] {
             assert!(
                 metrics
                     .method(method)
@@ -110,6 +148,49 @@ fn a_bundle_renders_what_was_scored() {
                 worst <= Some(1),
                 "{name}, {view}: differs by {worst:?} of 255"
             );
+        }
+    }
+}
+
+/// Every method has its row, and those that train their curve.
+#[test]
+fn all_methods_are_scored_beside_ours() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let capture = capture(dir.path(), 0.8);
+    let trained = [
+        "pix2pix_position",
+        "pix2pix_depth",
+        "ours_no_effects",
+        "paper",
+    ];
+    let cheap = ["vertex_color", "texture", "n_ibr", "ibr"];
+    for (preset, trained) in [("standard", &trained[..]), ("paper", &trained[..3])] {
+        let methods = [&cheap[..], trained].concat();
+        let mut recipe = recipe(&[("effects", "on"), ("methods", &methods.join(","))]);
+        recipe.preset = serde_json::from_value(preset.into()).expect("a preset");
+        let folder =
+            bake(&job(&capture, &dir.path().join(preset), recipe), &|_| {}).expect("a bake");
+        let bundle = Bundle::open(&folder).expect("it verifies");
+        let metrics = bundle.metrics().expect("metrics").expect("metrics.json");
+        let rows: Vec<&str> = metrics
+            .methods
+            .iter()
+            .map(|row| row.name.as_str())
+            .collect();
+        assert_eq!(rows, [&cheap[..], &["ours"], trained].concat(), "{preset}");
+        let mut errors: Vec<u64> = metrics.methods.iter().map(|r| r.mse.to_bits()).collect();
+        errors.sort_unstable();
+        errors.dedup();
+        assert_eq!(
+            errors.len(),
+            rows.len(),
+            "{preset}: two methods have one error"
+        );
+        for name in trained.iter().chain(&["ours"]) {
+            let row = metrics.method(name).expect("a row");
+            assert!(row.train_secs > 0.0, "{preset}: {name}");
+            let curve = metrics.speed_error.iter().filter(|p| p.method == **name);
+            assert!(curve.count() >= 2, "{preset}: {name}");
         }
     }
 }
@@ -156,8 +237,8 @@ fn a_checkpoint_that_cannot_be_used_starts_from_the_beginning() {
     let dir = tempfile::tempdir().expect("a folder");
     let capture = capture(dir.path(), 0.0);
     let last = RefCell::new(None);
-    let short = [("effects", "off"), ("ablate_effects", "off")];
-    let other = recipe(&[short[0], short[1], ("k", "3")]);
+    let short = [("effects", "off")];
+    let other = recipe(&[short[0], ("k", "3")]);
     bake(&job(&capture, &dir.path().join("one"), other), &|event| {
         if let Event::Checkpoint { path } = event {
             *last.borrow_mut() = Some(path);
@@ -169,8 +250,16 @@ fn a_checkpoint_that_cannot_be_used_starts_from_the_beginning() {
     let cut = dir.path().join("cut.safetensors");
     std::fs::write(&cut, &whole[..whole.len() / 2]).expect("written");
 
+    // Same seed, same device, same result: all three trainings from the beginning end alike.
     let afresh = job(&capture, &dir.path().join("afresh"), recipe(&short));
-    let expected = weights(&bake(&afresh, &|_| {}).expect("a bake"));
+    let expected = bake(&afresh, &|_| {}).expect("a bake");
+    let errors = |bundle: &Path| -> Vec<u64> {
+        let bundle = Bundle::open(bundle).expect("it verifies");
+        let metrics = bundle.metrics().expect("metrics").expect("metrics.json");
+        let rows = metrics.methods.iter().map(|row| row.mse);
+        let curve = metrics.speed_error.iter().map(|point| point.mse);
+        rows.chain(curve).map(f64::to_bits).collect()
+    };
     for (name, checkpoint) in [("other", of_another_recipe), ("cut", cut)] {
         let mut job = job(&capture, &dir.path().join(name), recipe(&short));
         job.checkpoint = Some(checkpoint);
@@ -180,7 +269,9 @@ fn a_checkpoint_that_cannot_be_used_starts_from_the_beginning() {
                 *warned.borrow_mut() |= message.contains("starts from the beginning");
             }
         });
-        assert!(weights(&bundle.expect("a bake")) == expected, "{name}");
+        let bundle = bundle.expect("a bake");
+        assert!(weights(&bundle) == weights(&expected), "{name}");
+        assert_eq!(errors(&bundle), errors(&expected), "{name}");
         assert!(warned.into_inner(), "{name}");
     }
 }

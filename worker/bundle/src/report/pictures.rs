@@ -32,7 +32,8 @@ impl ErrorScale {
     pub(super) fn over(views: &[ReportView]) -> Self {
         let mut histogram = [0_u64; 256];
         for view in views {
-            for image in [&view.ours, &view.baseline] {
+            let baseline = view.baseline.as_ref().map(|(_, image)| image);
+            for image in [Some(&view.ours), baseline].into_iter().flatten() {
                 for error in errors(image, &view.target) {
                     histogram[error as usize] += 1;
                 }

@@ -1,31 +1,41 @@
-//! Plots as inline SVG, coloured by the page's style sheet.
+//! Plots as SVG: inline in the page, coloured by its style sheet, or as a document of their own.
 
 use super::escape;
 
 /// How tick values are written.
-#[derive(Clone, Copy)]
-pub(super) enum Unit {
+#[derive(Clone, Copy, Debug)]
+pub enum Unit {
+    /// As numbers.
     Plain,
+    /// With s.
     Seconds,
+    /// With B, kB or MB.
     Bytes,
 }
 
-#[derive(Clone, Copy)]
-pub(super) struct Axis {
-    pub(super) label: &'static str,
-    pub(super) unit: Unit,
+/// One axis, logarithmic.
+#[derive(Clone, Copy, Debug)]
+pub struct Axis {
+    /// What it measures.
+    pub label: &'static str,
+    /// In what.
+    pub unit: Unit,
 }
 
 /// One method: a curve, a point, or (no training) a level.
-pub(super) struct Series {
+#[derive(Clone, Debug)]
+pub struct Series {
     class: String,
     label: String,
     points: Vec<(f64, f64)>,
+    /// Whether a line joins the points.
+    joined: bool,
 }
 
 impl Series {
-    /// Points that a logarithmic error axis cannot show are dropped.
-    pub(super) fn new(name: &str, label: &str, points: Vec<(f64, f64)>) -> Self {
+    /// `name` decides the colour (a method's name has its own), `label` stands beside it. Points that a logarithmic error
+    /// axis cannot show are dropped.
+    pub fn new(name: &str, label: &str, points: Vec<(f64, f64)>) -> Self {
         let class = if matches!(
             name,
             "ours" | "ours_no_effects" | "paper" | "n_ibr" | "ibr" | "texture"
@@ -42,21 +52,34 @@ impl Series {
             class: class.to_owned(),
             label: label.to_owned(),
             points,
+            joined: true,
+        }
+    }
+
+    /// The same as dots without a line: points in no order.
+    pub fn dots(name: &str, label: &str, points: Vec<(f64, f64)>) -> Self {
+        Self {
+            joined: false,
+            ..Self::new(name, label, points)
         }
     }
 }
 
 /// Error over a cost, both logarithmic.
-pub(super) struct Plot {
+#[derive(Clone, Debug)]
+pub struct Plot {
     /// Width and height of the drawing; the page scales it to the column.
-    pub(super) size: (f64, f64),
-    pub(super) series: Vec<Series>,
-    pub(super) x: Axis,
-    pub(super) y: Axis,
+    pub size: (f64, f64),
+    /// What is drawn.
+    pub series: Vec<Series>,
+    /// To the right.
+    pub x: Axis,
+    /// Upwards.
+    pub y: Axis,
 }
 
 /// Of the wide plots.
-pub(super) const WIDTH: f64 = 560.0;
+pub const WIDTH: f64 = 560.0;
 const LEFT: f64 = 46.0;
 /// Room for the names beside a plot, also in the larger type of a phone.
 const RIGHT: f64 = 152.0;
@@ -112,6 +135,15 @@ impl Scale {
 }
 
 impl Plot {
+    /// A file of its own, with its style; empty when there is nothing to draw.
+    pub fn document(&self) -> String {
+        let style = format!("<style>{}</style>", include_str!("style.css"));
+        self.svg()
+            .replacen("<svg ", "<svg xmlns=\"http://www.w3.org/2000/svg\" ", 1)
+            .replacen('>', &format!(">{style}"), 1)
+    }
+
+    /// For the page; empty when there is nothing to draw.
     pub(super) fn svg(&self) -> String {
         let (width, height) = self.size;
         let points = || self.series.iter().flat_map(|s| &s.points);
@@ -207,6 +239,9 @@ fn mark(series: &Series, x: &Scale, y: &Scale) -> String {
                     )
                 })
                 .collect();
+            if !series.joined {
+                return dots;
+            }
             format!(
                 "<polyline class=\"curve m-{}\" points=\"{}\"/>{dots}",
                 series.class,
