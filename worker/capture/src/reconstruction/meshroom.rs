@@ -14,6 +14,7 @@
 //! Source: `AliceVision`, `sfmDataIO/CHANGES.md` and `jsonIO.cpp`.
 
 use std::collections::BTreeMap;
+use std::f64::consts::TAU;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use serde::Deserialize;
@@ -315,6 +316,21 @@ fn source_camera(intrinsic: &Intrinsic, version: [f64; 3]) -> Result<SourceCamer
     if version >= [1.0, 2.0, 1.0] {
         cx += half[0];
         cy += half[1];
+    }
+    if intrinsic.kind == "equirectangular" {
+        let panorama = SourceCamera::panorama(width, height);
+        let off = [
+            fx - panorama.fx,
+            fy - panorama.fy,
+            cx - half[0],
+            cy - half[1],
+        ];
+        return match off.iter().all(|pixels| pixels.abs() * TAU < 1.0) {
+            true => Ok(panorama),
+            false => {
+                Err("has a picture of less than the whole sphere, which is not supported".into())
+            }
+        };
     }
     let undistorts = intrinsic
         .undistortion_type

@@ -53,7 +53,7 @@ fn capture(case: &str) -> tempfile::TempDir {
             fs::copy(entry.path(), to).expect("a copy");
         }
     }
-    let height = if case == "opensfm_spherical" { 48 } else { 70 };
+    let height = if case.ends_with("_spherical") { 48 } else { 70 };
     for name in NAMES {
         photograph(dir.path(), name, height);
     }

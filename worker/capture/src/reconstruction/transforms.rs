@@ -3,6 +3,7 @@
 //! A frame's `transform_matrix` places its camera in the world with axes x right, y up, z backwards. Intrinsics stand
 //! at the top and may be overridden by each frame. Pixels are measured from the top-left corner, as ours; the lens is
 //! `x' = x (1 + k1 r^2 + .. + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2)`, y likewise, on angles for the fisheye models.
+//! FISHEYE624 is Project Aria's lens, COLMAP's `RAD_TAN_THIN_PRISM_FISHEYE`: twelve `distortion_params`.
 //!
 //! # The world
 //! `applied_transform` and `applied_scale` say how nerfstudio's importers moved the reconstruction that they read.
@@ -27,7 +28,7 @@ use crate::fault::Faults;
 use crate::settings;
 
 const MODEL_HINT: &str = "convert the photographs to one of PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, \
-                          OPENCV_FISHEYE or EQUIRECTANGULAR";
+                          OPENCV_FISHEYE, FISHEYE624 or EQUIRECTANGULAR";
 const MATRIX_HINT: &str =
     "transform_matrix must be four rows of four numbers, or three: camera to world";
 
@@ -57,7 +58,7 @@ struct Entry {
     k6: Option<Number>,
     p1: Option<Number>,
     p2: Option<Number>,
-    /// k1..k4, p1, p2 in one list, as nerfstudio takes them too.
+    /// k1..k4, p1, p2 in one list, as nerfstudio takes them too; k0..k5, p0, p1, s0..s3 of FISHEYE624.
     distortion_params: Option<Vec<Number>>,
     ftheta_p0: Option<IgnoredAny>,
     latlong: Option<IgnoredAny>,
@@ -291,7 +292,7 @@ fn camera(
     }
     let fisheye = match name {
         None => is_fisheye,
-        Some("OPENCV_FISHEYE") => true,
+        Some("OPENCV_FISHEYE" | "FISHEYE624") => true,
         Some(
             "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "OPENCV" | "FULL_OPENCV",
         ) => false,
@@ -323,6 +324,15 @@ fn camera(
         .distortion_params
         .as_ref()
         .or(file.distortion_params.as_ref());
+    if name == Some("FISHEYE624") {
+        let bend = numbers::<12>(list.map_or(&[], Vec::as_slice)).ok_or((
+            format!("has {} distortion_params", list.map_or(0, Vec::len)),
+            "distortion_params of FISHEYE624 must be k0..k5, p0, p1, s0..s3",
+        ))?;
+        let params: Vec<f64> = [fx, fy, cx, cy].into_iter().chain(bend).collect();
+        let model = CameraModel::RadTanThinPrismFisheye;
+        return Ok(SourceCamera::from_params(model, width, height, &params));
+    }
     let [k1, k2, k3, k4, p1, p2] = match list {
         Some(list) => numbers::<6>(list).ok_or((
             format!("has {} distortion_params", list.len()),

@@ -214,6 +214,69 @@ def transforms_ngp() -> None:
                 file.write(f"{name} " + " ".join(f"{v:.17g}" for v in numbers) + "\n")
 
 
+def transforms_scaled() -> None:
+    """The converted COLMAP file of above, enlarged by 0.4 after its applied_transform. nerfstudio's own
+    transform_poses_to_original_space, which undoes both, gives the poses; the lens is judged by pycolmap."""
+    converted = json.loads((OUT / "transforms_opencv/transforms.json").read_text())
+    scale = 0.4
+    poses, originals = {}, np.linalg.inv(np.vstack([converted["applied_transform"], [0, 0, 0, 1]]))
+    for frame in converted["frames"]:
+        saved = np.array(frame["transform_matrix"])
+        saved[:3, 3] *= scale
+        frame["transform_matrix"] = saved.tolist()
+        # base_dataparser.py, transform_poses_to_original_space: centres are divided, then moved back, then turned to OpenCV's axes.
+        original = saved.copy()
+        original[:3, 3] /= scale
+        original = originals @ original
+        original[:3, 1:3] *= -1
+        poses[Path(frame["file_path"]).name] = pycolmap.Rigid3d(np.linalg.inv(original)[:3])
+    path = folder("transforms_scaled")
+    converted["applied_scale"] = scale
+    del converted["ply_file_path"]
+    (path / "transforms.json").write_text(json.dumps(converted, indent=1))
+    write_projections(path, by_pycolmap(LENS), {name: poses[name] for name in NAMES})
+
+
+def fisheye624(params: list[float]):
+    """Project Aria's FisheyeRadTanThinPrism, after nerfstudio's fisheye624_project (camera_utils.py)."""
+    fu, fv, cu, cv, *rest = params
+    k, (p0, p1), s = rest[:6], rest[6:8], rest[8:]
+
+    def project(in_camera):
+        a, b = in_camera[:2] / in_camera[2]
+        r = np.hypot(a, b)
+        theta = np.arctan(r)
+        bent = theta + sum(value * theta ** (3 + 2 * index) for index, value in enumerate(k))
+        x, y = bent * a / r, bent * b / r
+        r2 = x * x + y * y
+        u = x + (2 * x * x + r2) * p0 + 2 * x * y * p1 + s[0] * r2 + s[1] * r2 * r2
+        v = y + (2 * y * y + r2) * p1 + 2 * x * y * p0 + s[2] * r2 + s[3] * r2 * r2
+        return fu * u + cu, fv * v + cv
+
+    return project
+
+
+def transforms_fisheye624() -> None:
+    """After nerfstudio's process_project_aria.py; pixels by the formula in nerfstudio, which pycolmap's model agrees with."""
+    bend = [-0.03, 0.1, -0.07, 0.012, 0.002, -0.001, 0.0005, -0.0008, 0.001, -0.0003, -0.0007, 0.0002]
+    params = [F, 92.5, CX, CY, *bend]
+    project, lens = fisheye624(params), camera("RAD_TAN_THIN_PRISM_FISHEYE", params)
+    path = folder("transforms_fisheye624")
+    frames = [
+        {
+            "fl_x": F, "fl_y": 92.5, "cx": CX, "cy": CY, "distortion_params": bend, "w": W, "h": H,
+            "file_path": f"images/{name}", "timestamp": 1000 + index,
+            "transform_matrix": (np.linalg.inv(matrix(pose)) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+        }
+        for index, (name, pose) in enumerate(POSES.items())
+    ]
+    for pose in POSES.values():
+        for point in POINTS:
+            assert np.allclose(project(pose * point), lens.img_from_cam(pose * point), atol=1e-9)
+    (path / "transforms.json").write_text(json.dumps({"camera_model": "FISHEYE624", "frames": frames}, indent=1))
+    write_projections(path, project)
+
+
 def numbers(values) -> str:
     return " ".join(f"{value:.17g}" for value in np.ravel(values))
 
@@ -228,7 +291,7 @@ COMPONENT = (rotation_of(0.2, -0.5, 0.1, 0.8), np.array([3.0, -2.0, 5.0]), 1.7)
 
 
 def metashape_xml(
-    calibration: dict, kind: str, component=COMPONENT, in_chunk: bool = False, initial: bool = True
+    calibration: dict, kind: str, component=COMPONENT, in_chunk: bool = False, initial: bool = True, height: int = H
 ) -> str:
     """After the files that Metashape 2 writes."""
     rotation, translation, scale = component
@@ -249,7 +312,7 @@ def metashape_xml(
             f"<transform>{numbers(local)}</transform><orientation>1</orientation></camera>"
         )
     values = "".join(f"<{key}>{value:.17g}</{key}>" for key, value in calibration.items())
-    size = f'<resolution width="{W}" height="{H}"/>'
+    size = f'<resolution width="{W}" height="{height}"/>'
     components = (
         "" if in_chunk else
         f'<components next_id="1" active_id="0"><component id="0" label="Component 1">{transform}</component></components>'
@@ -318,6 +381,10 @@ def metashape() -> None:
         "THIN_PRISM_FISHEYE", [F, F, CX, CY, K1, K2, values["p2"], values["p1"], 0.02, -0.01, 0.0, 0.0]
     )
     write_projections(path, by_pycolmap(judge_fisheye))
+    path = folder("metashape_spherical")
+    (path / "cameras.xml").write_text(metashape_xml({}, "spherical", height=W // 2))
+    panorama = pycolmap.Camera(camera_id=1, model="EQUIRECTANGULAR", width=W, height=W // 2, params=[W, W // 2])
+    write_projections(path, by_pycolmap(panorama))
     # nerfstudio divides by the component's scale, takes p1, p2 in OpenCV's order and the first calibration: a file where
     # that is no matter.
     path = folder("metashape_plain")
@@ -496,6 +563,20 @@ def meshroom() -> None:
     })
     lens = camera("OPENCV_FISHEYE", [F, 92.5, CX, CY, -0.05, 0.02, -0.01, 0.003])
     write_projections(path, by_pycolmap(lens), judged_poses(path / "cameras.sfm"))
+    # One angle for the whole lens: COLMAP's FOV, as AliceVision's own export to COLMAP has it.
+    path = folder("meshroom_fisheye1")
+    write(path / "cameras.sfm", [1, 2, 6], millimetres | {
+        "type": "fisheye1", "pixelRatio": "1", "principalPoint": texts([CX - W / 2, CY - H / 2]),
+        "distortionParams": texts([0.9]),
+    })
+    write_projections(path, by_pycolmap(camera("FOV", [F, F, CX, CY, 0.9])), judged_poses(path / "cameras.sfm"))
+    path = folder("meshroom_spherical")
+    write(path / "cameras.sfm", [1, 2, 8], millimetres | {
+        "type": "equirectangular", "height": str(W // 2), "focalLength": f"{36 / (2 * np.pi):.17g}", "pixelRatio": "1",
+        "principalPoint": ["0", "0"], "distortionParams": "",
+    })
+    panorama = pycolmap.Camera(camera_id=1, model="EQUIRECTANGULAR", width=W, height=W // 2, params=[W, W // 2])
+    write_projections(path, by_pycolmap(panorama), judged_poses(path / "cameras.sfm"))
 
 
 def opensfm() -> None:
@@ -556,6 +637,33 @@ def opensfm() -> None:
     })
     lens = camera("OPENCV_FISHEYE", [F, 92.5, CX, CY, -0.05, 0.02, -0.01, 0.003])
     write_projections(path, by_pycolmap(lens), poses)
+    # Six radial and two tangential terms, in numpy after OpenSfM's Disto62; with four of them it is COLMAP's thin prism.
+    def disto62(k, p1, p2):
+        def project(in_camera):
+            a, b = in_camera[:2]
+            r = np.hypot(a, b)
+            theta = np.arctan2(r, in_camera[2])
+            x, y = theta * a / r, theta * b / r
+            r2 = theta * theta
+            bent = 1 + sum(value * r2 ** (index + 1) for index, value in enumerate(k))
+            u = x * bent + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            v = y * bent + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+            return F * u + CX, 92.5 * v + CY
+
+        return project
+
+    four = camera("THIN_PRISM_FISHEYE", [F, 92.5, CX, CY, -0.05, 0.02, P1, P2, -0.01, 0.003, 0.0, 0.0])
+    for pose in POSES.values():
+        for point in POINTS:
+            seen = disto62([-0.05, 0.02, -0.01, 0.003, 0.0, 0.0], P1, P2)(pose * point)
+            assert np.allclose(seen, four.img_from_cam(pose * point), atol=1e-9)
+    path = folder("opensfm_fisheye62")
+    bend = [-0.05, 0.02, -0.01, 0.003, 0.002, -0.001]
+    poses = write(path / "reconstruction.json", {
+        "projection_type": "fisheye62", "focal_x": F / side, "focal_y": 92.5 / side, **center,
+        **{f"k{index + 1}": value for index, value in enumerate(bend)}, "p1": P1, "p2": P2,
+    })
+    write_projections(path, disto62(bend, P1, P2), poses)
     path = folder("opensfm_spherical")
     poses = write(path / "reconstruction.json", {"projection_type": "spherical", "width": W, "height": W // 2})
     lens = pycolmap.Camera(camera_id=1, model="EQUIRECTANGULAR", width=W, height=W // 2, params=[W, W // 2])
@@ -618,7 +726,7 @@ def main() -> None:
     stand_in_for_heavy_imports()
     OUT.mkdir(exist_ok=True)
     for write in [
-        colmap, colmap_rig, transforms_nerfstudio, transforms_ngp, metashape, reality_capture, meshroom, opensfm, bundler,
+        colmap, colmap_rig, transforms_nerfstudio, transforms_scaled, transforms_ngp, transforms_fisheye624, metashape, reality_capture, meshroom, opensfm, bundler,
     ]:
         write()
 
