@@ -19,6 +19,9 @@ pub(crate) struct Args {
     /// Side of the images that are going to be baked, in pixels
     #[arg(long, value_name = "PX", default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=4096))]
     size: u32,
+    /// Seconds of training that the recipe is going to allow
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    budget_secs: Option<u32>,
     /// Proxy mesh to use instead of the capture's own, by its path inside the capture
     #[arg(long, value_name = "FILE")]
     proxy: Option<PathBuf>,
@@ -48,6 +51,7 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
         let options = PreflightOptions {
             proxy: args.proxy.clone(),
             size: args.size,
+            budget_secs: args.budget_secs.map(f64::from),
         };
         let report = examine(path.clone(), options).await?;
         reports.push(ReportView { path, report });

@@ -513,6 +513,7 @@ async fn check(order: Order) -> Result<CheckView, Problem> {
     let options = PreflightOptions {
         proxy: None,
         size: order.recipe.size,
+        budget_secs: order.recipe.budget_secs.map(|secs| secs as f64),
     };
     let report = preflight::examine(order.capture.clone(), options).await?;
     let counts = report.findings.as_ref().map(|findings| &findings.counts);

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use ign_bundle::metrics::{Metrics, SCHEMA, ViewCounts};
-use ign_capture::{Gains, ImportError, ImportOptions, Preflight, Survey};
+use ign_capture::{Gains, ImportError, ImportOptions, Preflight, PreflightOptions, Survey};
 use ign_events::Event;
 use serde_json::json;
 
@@ -47,21 +47,20 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
     let device = ign_nets::select_device();
 
     reporter.stage("import", "reading the capture");
-    let options = ImportOptions {
+    let asked = PreflightOptions {
         proxy: job.recipe.proxy.as_ref().map(PathBuf::from),
+        size: job.recipe.size,
+        budget_secs: job.recipe.budget_secs,
+    };
+    let options = ImportOptions {
+        proxy: asked.proxy.clone(),
     };
     let scene = ign_capture::import(&job.capture_dir, &options)?;
     let settings = job.recipe.resolve(scene.train.len())?;
     reporter.step(0.2, "comparing the photographs at common surface points");
     let survey = Survey::new(&scene);
     let estimated = Gains::estimate(&scene, &survey);
-    let preflight = Preflight::of(
-        &job.capture_dir,
-        &scene,
-        &survey,
-        &estimated,
-        job.recipe.size,
-    );
+    let preflight = Preflight::of(&job.capture_dir, &scene, &survey, &estimated, &asked);
     drop(survey);
     for fault in &preflight.faults {
         reporter.warn(format!("{} ({})", fault.message, fault.at));

@@ -79,7 +79,8 @@ pub(crate) fn find_proxy(
             faults.error(
                 format!("the proxy {} is missing", path.display()),
                 at,
-                "check the name: it is a path inside the capture folder",
+                "check the name: it is a path inside the capture folder; where none is named, one is built from the \
+                 model's points",
             );
             return Proxy::Faulty;
         }

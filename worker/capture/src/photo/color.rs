@@ -56,8 +56,8 @@ pub(super) enum ExifColor {
 /// A conversion to sRGB.
 #[derive(Clone)]
 pub(super) struct Conversion {
+    source: ColorProfile,
     eight: Arc<Transform8BitExecutor>,
-    sixteen: Arc<Transform16BitExecutor>,
 }
 
 impl std::fmt::Debug for Conversion {
@@ -72,7 +72,7 @@ impl ColorTag {
         let Some(profile) = self.profile()? else {
             return Ok(None);
         };
-        let conversion = Conversion::new(&profile).map_err(|error| refused(&error))?;
+        let conversion = Conversion::new(profile).map_err(|error| refused(&error))?;
         Ok((!conversion.is_identity()?).then_some(conversion))
     }
 
@@ -222,17 +222,25 @@ fn from_icc(icc: &[u8]) -> Result<ColorProfile, PhotoError> {
     }
 }
 
+fn options() -> TransformOptions {
+    TransformOptions {
+        rendering_intent: RenderingIntent::RelativeColorimetric,
+        ..TransformOptions::default()
+    }
+}
+
 impl Conversion {
-    fn new(source: &ColorProfile) -> Result<Self, moxcms::CmsError> {
+    fn new(source: ColorProfile) -> Result<Self, moxcms::CmsError> {
         let srgb = ColorProfile::new_srgb();
-        let options = TransformOptions {
-            rendering_intent: RenderingIntent::RelativeColorimetric,
-            ..TransformOptions::default()
-        };
-        Ok(Self {
-            eight: source.create_transform_8bit(Layout::Rgb, &srgb, Layout::Rgb, options)?,
-            sixteen: source.create_transform_16bit(Layout::Rgb, &srgb, Layout::Rgb, options)?,
-        })
+        let eight = source.create_transform_8bit(Layout::Rgb, &srgb, Layout::Rgb, options())?;
+        Ok(Self { source, eight })
+    }
+
+    /// Made where it is needed: its tables take longer than those of 8 bits, and most profiles are sRGB's.
+    fn sixteen(&self) -> Result<Arc<Transform16BitExecutor>, moxcms::CmsError> {
+        let srgb = ColorProfile::new_srgb();
+        self.source
+            .create_transform_16bit(Layout::Rgb, &srgb, Layout::Rgb, options())
     }
 
     /// Moves no 8-bit colour of a grid, and no grey, by more than one level.
@@ -254,7 +262,10 @@ impl Conversion {
     pub(super) fn apply(&self, samples: &mut Samples) -> Result<f64, PhotoError> {
         match samples {
             Samples::Eight(data) => convert(&*self.eight, data, u8::MAX),
-            Samples::Sixteen(data) => convert(&*self.sixteen, data, u16::MAX),
+            Samples::Sixteen(data) => {
+                let sixteen = self.sixteen().map_err(|error| refused(&error))?;
+                convert(&*sixteen, data, u16::MAX)
+            }
         }
     }
 }

@@ -38,6 +38,8 @@ pub struct PreflightOptions {
     pub proxy: Option<PathBuf>,
     /// Side of the images that are going to be baked, in pixels; the forecast depends on it.
     pub size: u32,
+    /// Seconds of training at most, as the recipe says; the forecast depends on it.
+    pub budget_secs: Option<f64>,
 }
 
 /// What is known about a capture before it is baked. The JSON form is stable; it may gain fields.
@@ -135,7 +137,7 @@ pub fn preflight(dir: &Path, options: &PreflightOptions) -> Preflight {
             let import_secs = began.elapsed().as_secs_f64();
             let survey = Survey::new(&scene);
             let gains = Gains::estimate(&scene, &survey);
-            let mut report = Preflight::of(dir, &scene, &survey, &gains, options.size);
+            let mut report = Preflight::of(dir, &scene, &survey, &gains, options);
             if let Some(findings) = &mut report.findings {
                 findings.forecast.import_secs = import_secs;
             }
@@ -164,12 +166,18 @@ pub fn preflight(dir: &Path, options: &PreflightOptions) -> Preflight {
 
 impl Preflight {
     /// The report on a scene, imported from `dir`, that was surveyed.
-    pub fn of(dir: &Path, scene: &Scene, survey: &Survey, gains: &Gains, size: u32) -> Self {
+    pub fn of(
+        dir: &Path,
+        scene: &Scene,
+        survey: &Survey,
+        gains: &Gains,
+        options: &PreflightOptions,
+    ) -> Self {
         let mut faults = Faults::default();
         faults.extend(scene.warnings.iter().cloned());
         faults.extend(survey.faults.iter().cloned());
         let counts = counts(dir, scene);
-        check_resolution(&counts, size, &mut faults);
+        check_resolution(&counts, options.size, &mut faults);
         let findings = Findings {
             coverage: coverage::coverage(scene, survey, &mut faults),
             baselines: path::baselines(scene, survey, &mut faults),
@@ -178,7 +186,7 @@ impl Preflight {
             exposure: photographs::exposure(scene, survey, gains, &mut faults),
             light: photographs::light(survey, &mut faults),
             scale: scale::scale(scene, &mut faults),
-            forecast: forecast::forecast(dir, scene, survey, size),
+            forecast: forecast::forecast(dir, scene, survey, options),
             counts,
         };
         Self {

@@ -184,12 +184,17 @@ fn lines(findings: &Findings) -> Vec<Line> {
         line(
             "forecast",
             format!(
-                "{} to upload; at {} px about {} of memory and a bundle of {}; training {}",
+                "{} to upload; at {} px about {} of memory and a bundle of {}; {} of training, {}",
                 bytes(forecast.capture_bytes),
                 forecast.size,
                 bytes(forecast.training_bytes),
                 bytes(forecast.bundle_bytes),
-                duration(forecast.training_secs)
+                duration(forecast.training_secs),
+                if forecast.ends_by_budget {
+                    "the recipe's budget"
+                } else {
+                    "roughly, on two CPU cores"
+                }
             ),
             false,
         ),

@@ -325,12 +325,13 @@ fn source_camera(intrinsic: &Intrinsic, version: [f64; 3]) -> Result<SourceCamer
             cx - half[0],
             cy - half[1],
         ];
-        return match off.iter().all(|pixels| pixels.abs() * TAU < 1.0) {
-            true => Ok(panorama),
-            false => {
-                Err("has a picture of less than the whole sphere, which is not supported".into())
-            }
-        };
+        // Half a pixel at the picture's edge.
+        if off.iter().any(|pixels| pixels.abs() * TAU > 1.0) {
+            return Err(
+                "has a picture of less than the whole sphere, which is not supported".into(),
+            );
+        }
+        return Ok(panorama);
     }
     let undistorts = intrinsic
         .undistortion_type

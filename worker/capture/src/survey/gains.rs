@@ -70,7 +70,7 @@ impl Gains {
         for &view in &scene.train {
             trains[view] = true;
         }
-        let (mut shares, mut logs) = (Vec::new(), vec![[0.0; 3]; count]);
+        let (mut shares, mut found) = (Vec::new(), vec![[None; 3]; count]);
         for channel in 0..3 {
             let all = survey.channel(channel);
             let train: Vec<Datum<ANGLE_TERMS>> = all
@@ -86,10 +86,11 @@ impl Gains {
             shares.push(explained(&plain, &equal));
             let effects = with_held_out(&Effects::fit(&train, count), &all, &trains);
             let usual = mean(scene.train.iter().filter_map(|&view| effects[view]));
-            for (log, effect) in logs.iter_mut().zip(effects) {
-                log[channel] = effect.map_or(0.0, |effect| usual - effect);
+            for (found, effect) in found.iter_mut().zip(effects) {
+                found[channel] = effect.map(|effect| usual - effect);
             }
         }
+        let logs: Vec<[f64; 3]> = found.iter().map(whole).collect();
         let bound = LARGEST.ln();
         gains.estimated = logs
             .iter()
@@ -118,6 +119,13 @@ impl Gains {
         }
         gains
     }
+}
+
+/// A channel of which too little is seen, because it is clipped, gets the mean of the others: left at the usual exposure it
+/// would tint the photograph.
+fn whole(found: &[Option<f64>; 3]) -> [f64; 3] {
+    let others = mean(found.iter().flatten().copied());
+    found.map(|log| log.unwrap_or(others))
 }
 
 fn mean(values: impl Iterator<Item = f64>) -> f64 {

@@ -24,7 +24,7 @@ const DETAIL_FLOOR: f64 = 1e-7;
 pub(crate) struct Look {
     /// Linear light, in [0, 1].
     pub(crate) linear: [f32; 3],
-    /// Whether the value of some pixel around is at the sensor's limit, per channel.
+    /// Whether the value of some pixel around is at the sensor's upper or lower limit, per channel.
     pub(crate) clipped: [bool; 3],
     /// Logarithm of the relative mean square of second differences, per direction; none next to a rim.
     pub(crate) detail: Option<[f32; 4]>,
@@ -128,7 +128,7 @@ impl Small {
                 for channel in 0..3 {
                     let value = image.rgb[from * 3 + channel];
                     small.linear[to][channel] += share * linear(value);
-                    small.clipped[to][channel] |= value >= WHITE;
+                    small.clipped[to][channel] |= value >= WHITE || value <= BLACK;
                 }
             }
         }

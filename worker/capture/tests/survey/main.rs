@@ -6,7 +6,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use ign_capture::{
-    Gains, ImportOptions, Preflight, PreflightOptions, Scene, Severity, Survey, import, preflight,
+    Gains, ImportError, ImportOptions, Preflight, PreflightOptions, Scene, Severity, Survey,
+    import, preflight,
 };
 use ign_demo::{DemoOptions, Shape, generate};
 use image::{Rgb, RgbImage};
@@ -37,6 +38,7 @@ fn report(dir: &Path) -> Preflight {
         &PreflightOptions {
             proxy: None,
             size: 64,
+            budget_secs: None,
         },
     )
 }
@@ -91,6 +93,23 @@ fn drift(view: usize) -> [f64; 3] {
     })
 }
 
+/// The gains undo `factor` in every view to a percent, up to the one factor that nobody can know.
+fn assert_recovered(gains: &Gains, channel: usize, factor: impl Fn(usize) -> f64) {
+    let views = gains.per_view.iter().enumerate();
+    let products: Vec<f64> = views
+        .map(|(view, gain)| gain[channel] * factor(view))
+        .collect();
+    let mean = products.iter().sum::<f64>() / products.len() as f64;
+    let off: Vec<f64> = products
+        .iter()
+        .map(|product| 100.0 * (product / mean - 1.0))
+        .collect();
+    assert!(
+        off.iter().all(|percent| percent.abs() < 1.0),
+        "channel {channel}: off by percent {off:.2?}"
+    );
+}
+
 #[test]
 fn exposures_are_recovered_to_a_percent() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -112,22 +131,41 @@ fn exposures_are_recovered_to_a_percent() {
     let gains = Gains::estimate(&scene, &Survey::new(&scene));
     assert!(gains.needed && gains.explained > 0.3, "{}", gains.explained);
     for channel in 0..3 {
-        // Up to the one factor that nobody can know.
-        let product = |view: usize| gains.per_view[view][channel] * drift(view)[channel];
-        let mean = (0..scene.views.len()).map(product).sum::<f64>() / scene.views.len() as f64;
-        let off: Vec<f64> = (0..scene.views.len())
-            .map(|view| 100.0 * (product(view) / mean - 1.0))
-            .collect();
-        assert!(
-            off.iter().all(|percent| percent.abs() < 1.0),
-            "channel {channel}: off by percent {off:.2?}"
-        );
+        assert_recovered(&gains, channel, |view| drift(view)[channel]);
     }
     let report = report(&out);
     assert!(report.ok);
     let findings = report.findings.expect("findings");
     assert!(findings.exposure.drifts && findings.exposure.white_balance_spread > 0.1);
     assert!(findings.exposure.spread_stops > 0.4);
+}
+
+#[test]
+fn clipped_highlights_do_not_pull_at_the_gains() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = capture(
+        dir.path(),
+        &DemoOptions {
+            shape: Shape::Bowl,
+            gloss: 0.0,
+            size: 160,
+            views: 36,
+            ..options()
+        },
+    );
+    // Every third photograph is so bright that most of the white glaze reaches the sensor's limit.
+    let factor = |view: usize| if view.is_multiple_of(3) { 2.2 } else { 0.9 };
+    for (view, name) in names(&out).iter().enumerate() {
+        retouch(&out, name, |image| exposed(&image, [factor(view); 3]));
+    }
+    let scene = imported(&out);
+    let exposure = report(&out).findings.expect("findings").exposure;
+    assert!(exposure.overexposed.len() >= 6, "{exposure:?}");
+    let gains = Gains::estimate(&scene, &Survey::new(&scene));
+    assert!(gains.needed);
+    for channel in 0..3 {
+        assert_recovered(&gains, channel, factor);
+    }
 }
 
 #[test]
@@ -312,4 +350,207 @@ fn one_view_and_a_damaged_photograph_are_reported() {
     let single = report(&out);
     comes_back(&single);
     assert!(!single.ok && single.findings.is_none());
+}
+
+/// The capture without some of its model's views.
+fn without_views(dir: &Path, keep: impl Fn(usize) -> bool) {
+    let path = dir.join("sparse/0/images.txt");
+    let model = fs::read_to_string(&path).expect("the model");
+    let (comments, lines): (Vec<&str>, Vec<&str>) =
+        model.lines().partition(|line| line.starts_with('#'));
+    let kept = lines.chunks(2).enumerate().filter(|(view, _)| keep(*view));
+    let kept: Vec<&str> = kept.flat_map(|(_, lines)| lines.iter().copied()).collect();
+    fs::write(path, [comments, kept].concat().join("\n") + "\n").expect("written");
+    // Held-out views that are no more.
+    fs::remove_file(dir.join("test.txt")).expect("removed");
+}
+
+fn warns(report: &Preflight, start: &str) -> bool {
+    report.faults.iter().any(|fault| {
+        fault.severity == Severity::Warning
+            && fault.message.contains(start)
+            && !fault.hint.is_empty()
+    })
+}
+
+/// The demo's views go round the object in a spiral: neighbours in it are neighbours around the object.
+#[test]
+fn baselines_that_are_wide_one_sided_or_nothing_are_told() {
+    let small = DemoOptions {
+        size: 40,
+        views: 60,
+        ..options()
+    };
+    let wide = "neighbouring views are";
+    let one_sided = "all views lie within";
+    let repeated = "views repeat another one's place";
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = capture(dir.path(), &small);
+    let sound_model = fs::read_to_string(out.join("sparse/0/images.txt")).expect("the model");
+    let held_out = fs::read_to_string(out.join("test.txt")).expect("a list");
+    let scene = imported(&out);
+    let found = |change: &dyn Fn()| {
+        fs::write(out.join("sparse/0/images.txt"), &sound_model).expect("written");
+        fs::write(out.join("test.txt"), &held_out).expect("written");
+        change();
+        let report = report(&out);
+        let baselines = report
+            .findings
+            .as_ref()
+            .expect("findings")
+            .baselines
+            .clone();
+        let told = [wide, one_sided, repeated].map(|words| warns(&report, words));
+        (baselines, told)
+    };
+
+    let (sound, told) = found(&|| ());
+    assert_eq!(told, [false; 3], "{sound:?}");
+    assert!(sound.nearest_degrees_median < 25.0 && sound.widest_degrees > 120.0);
+
+    let (few, told) = found(&|| without_views(&out, |view| view % 7 == 0));
+    assert_eq!(told, [true, false, false], "{few:?}");
+    assert!(few.nearest_degrees_median > 25.0);
+
+    let middle = scene.views[30].camera.center();
+    let (near, told) = found(&|| {
+        without_views(&out, |view| {
+            let center = scene.views[view].camera.center();
+            middle.angle_between(center).to_degrees() < 22.0
+        });
+    });
+    assert!(told[1] && !told[2], "{near:?}");
+    assert!(near.widest_degrees < 45.0);
+
+    let (twice, told) = found(&|| {
+        let name = &scene.views[scene.train[4]].name;
+        let line = sound_model.lines().find(|line| line.ends_with(name));
+        let (rest, _) = line.and_then(|line| line.rsplit_once(' ')).expect("a view");
+        let (_, pose) = rest.split_once(' ').expect("an id");
+        for folder in ["images", "masks"] {
+            let folder = out.join(folder);
+            fs::copy(folder.join(name), folder.join("copy.png")).expect("a copy");
+        }
+        let model = format!("{sound_model}999 {pose} copy.png\n\n");
+        fs::write(out.join("sparse/0/images.txt"), model).expect("written");
+    });
+    assert_eq!(told, [false, false, true], "{twice:?}");
+    assert_eq!(twice.duplicates.len(), 1);
+}
+
+#[test]
+fn a_loose_reconstruction_is_told() {
+    for (error_px, told) in [(0.4, false), (1.9, true)] {
+        let dir = tempfile::tempdir().expect("a folder");
+        let out = capture(
+            dir.path(),
+            &DemoOptions {
+                size: 40,
+                views: 12,
+                ..options()
+            },
+        );
+        let path = out.join("sparse/0/points3D.txt");
+        let points: Vec<String> = (1..=50)
+            .map(|id| format!("{id} 0 0 0.{id:02} 9 9 9 {error_px} 1 0 2 0"))
+            .collect();
+        fs::write(&path, points.join("\n")).expect("points");
+        let report = report(&out);
+        let found = report
+            .findings
+            .as_ref()
+            .and_then(|findings| findings.reprojection.clone())
+            .expect("points with errors");
+        assert!(
+            (found.median_px - error_px).abs() < 1e-9 && (found.mean_px - error_px).abs() < 1e-9
+        );
+        assert_eq!(warns(&report, "the reconstruction fits loosely"), told);
+    }
+}
+
+#[test]
+fn sizes_and_places_are_told() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = capture(
+        dir.path(),
+        &DemoOptions {
+            size: 40,
+            views: 12,
+            ..options()
+        },
+    );
+    let settings = |metres: &str| {
+        fs::write(out.join("capture.toml"), metres).expect("settings");
+        let report = report(&out);
+        let told = warns(&report, "metres large");
+        (report.findings.expect("findings").scale, told)
+    };
+    let (unknown, told) = settings("");
+    assert!(!told && unknown.extent_metres.is_none() && !unknown.georeferenced);
+    assert!(unknown.words.starts_with("size unknown"));
+    let unit = 0.3 / unknown.extent;
+    let (usual, told) = settings(&format!("metres_per_scene_unit = {unit}\n"));
+    assert!(!told && (usual.extent_metres.expect("metres") - 0.3).abs() < 1e-9);
+    assert_eq!(usual.words, "can be held in two hands");
+    // Millimetres taken for metres.
+    let (huge, told) = settings(&format!("metres_per_scene_unit = {}\n", 1000.0 * unit));
+    assert!(told && huge.words == "larger than a person", "{huge:?}");
+}
+
+#[test]
+fn the_forecast_follows_the_recipe() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = capture(
+        dir.path(),
+        &DemoOptions {
+            size: 40,
+            views: 12,
+            ..options()
+        },
+    );
+    let forecast = |size: u32, budget_secs: Option<f64>| {
+        let options = PreflightOptions {
+            proxy: None,
+            size,
+            budget_secs,
+        };
+        let report = preflight(&out, &options);
+        let words = report.lines().last().expect("a line").text.clone();
+        (report.findings.expect("findings").forecast, words)
+    };
+    let (free, words) = forecast(64, None);
+    assert!(
+        !free.ends_by_budget && words.contains("roughly, on two CPU cores"),
+        "{words}"
+    );
+    let (short, words) = forecast(64, Some(90.0));
+    assert!(short.ends_by_budget && (short.training_secs - 90.0).abs() < 1e-9);
+    assert!(
+        words.contains("2 min of training, the recipe's budget"),
+        "{words}"
+    );
+    // A budget beyond what the steps take ends nothing.
+    let (long, _) = forecast(64, Some(1e6));
+    assert!(!long.ends_by_budget && (long.training_secs - free.training_secs).abs() < 1e-9);
+    let (large, _) = forecast(128, None);
+    assert!(large.training_bytes > free.training_bytes && large.bundle_bytes > free.bundle_bytes);
+}
+
+#[test]
+fn without_a_mesh_the_demos_points_make_one() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let out = capture(dir.path(), &options());
+    let (center, radius) = imported(&out).mesh.bounding_sphere();
+    fs::remove_file(out.join("mesh.ply")).expect("removed");
+    let named = match import(&out, &ImportOptions::default()) {
+        Err(ImportError::Faults(faults)) => faults,
+        other => panic!("{other:?}"),
+    };
+    assert!(named[0].at.starts_with("capture.toml") && named[0].hint.contains("model's points"));
+    fs::remove_file(out.join("capture.toml")).expect("removed");
+    let scene = imported(&out);
+    let words = scene.info.proxy_built.as_ref().expect("built");
+    let (built_center, built_radius) = scene.mesh.bounding_sphere();
+    assert!(built_center.distance(center) < 0.1 * radius, "{words}");
+    assert!((built_radius / radius - 1.0).abs() < 0.1, "{words}");
 }
