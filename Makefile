@@ -5,10 +5,11 @@
 #   make test                       everything: formats, lints, all tests; ends with "N passed, N failed"
 #   make lint                       formats and lints alone
 #   make setup                      libtorch into the per-user cache, linked as .libtorch
+#   make fuzz TARGET=name [SECS=60]  one parser under libFuzzer; needs cargo-fuzz, see tests/fuzz
 #   make bench [BENCH=name] [ARGS="--views 20 --rounds 1"]   speed beside a peer, one case or all; see tests/bench
 
 .POSIX:
-.PHONY: bake test lint bench setup build
+.PHONY: bake test lint bench fuzz setup build
 
 CARGO = cargo
 # One profile serves baking and testing: the numeric code is optimised in it, and nothing is compiled twice.
@@ -20,6 +21,8 @@ PRESET = standard
 OUT =
 ARGS =
 BENCH =
+TARGET =
+SECS = 60
 # The demo finishes within four minutes on two cores.
 DEMO_ARGS = --size 128 --budget-secs 90
 
@@ -54,6 +57,12 @@ lint: setup
 
 bench:
 	python3 tests/bench/run.py $(BENCH) $(ARGS)
+
+fuzz: setup
+	cp Cargo.lock tests/fuzz/fuzz/Cargo.lock
+	mkdir -p tests/fuzz/fuzz/corpus/$(TARGET)
+	cd tests/fuzz && RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run --sanitizer none $(TARGET) \
+		fuzz/corpus/$(TARGET) corpus/$(TARGET) -- -max_total_time=$(SECS) -rss_limit_mb=2048
 
 setup:
 	worker/setup-libtorch.sh

@@ -4,12 +4,16 @@
 //! to stderr, both only through `output`. The exit code is 0 when all was done, 1 when something failed, 2 for a wrong
 //! command line, 3 when the coordinator cannot be reached, 4 when a timeout passed.
 //! Invariant: nothing here links libtorch; what needs it runs in `ign-worker`.
+//!
+//! A library with one entry, [`main`], so that the fuzz targets reach what reads files of others.
 
 mod bag;
 mod commands;
 mod connection;
 mod data_plane;
 mod embedded;
+#[doc(hidden)]
+pub mod fuzz;
 mod output;
 mod pack;
 mod problem;
@@ -108,7 +112,8 @@ struct Context {
     format: Format,
 }
 
-fn main() -> ExitCode {
+/// Runs the command line of this process.
+pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(error) => {

@@ -7,7 +7,6 @@
 //! 1 failed, 2 wrong usage.
 
 mod agent;
-mod cameras;
 mod demo;
 mod exec;
 mod experiment;

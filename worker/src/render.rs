@@ -8,8 +8,8 @@ use ign_geometry::Camera;
 use ign_proto::FilePath;
 use ign_render::BundleRenderer;
 
+use crate::gpu;
 use crate::output::{self, Steps};
-use crate::{cameras, gpu};
 
 #[derive(Debug, clap::Args)]
 #[command(group = clap::ArgGroup::new("what").required(true))]
@@ -97,11 +97,13 @@ fn views(options: &Options, renderer: &BundleRenderer) -> Result<Vec<View>> {
         return Ok(named.collect());
     }
     if let Some(file) = &options.cameras {
-        let named = cameras::read(file)?.into_iter().map(|(name, camera)| View {
-            name,
-            camera,
-            in_world: true,
-        });
+        let named = ign_render::read_cameras(file)?
+            .into_iter()
+            .map(|(name, camera)| View {
+                name,
+                camera,
+                in_world: true,
+            });
         return Ok(named.collect());
     }
     let name = options.view.clone().unwrap_or_default();

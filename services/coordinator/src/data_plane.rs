@@ -198,7 +198,7 @@ struct BlobPath {
 }
 
 #[derive(Debug, PartialEq, Eq)]
-enum Wanted {
+pub(crate) enum Wanted {
     All,
     Part(Range<u64>),
     Nothing,
@@ -206,7 +206,7 @@ enum Wanted {
 
 /// What a `Range` header asks of a blob. Forms that are not served (several ranges, other units) ask for all of it, as
 /// HTTP allows.
-fn wanted_range(header: &str, size: u64) -> Wanted {
+pub(crate) fn wanted_range(header: &str, size: u64) -> Wanted {
     let parse = |header: &str| -> Option<Wanted> {
         let (first, last) = header.strip_prefix("bytes=")?.split_once('-')?;
         let range = match (first.trim(), last.trim()) {
@@ -417,7 +417,7 @@ fn pieces(
 }
 
 /// First byte of `Content-Range: 5-9`, also with HTTP's own `bytes ` before it and `/10` behind.
-fn content_range_start(headers: &HeaderMap) -> Result<Option<u64>, Refused> {
+pub(crate) fn content_range_start(headers: &HeaderMap) -> Result<Option<u64>, Refused> {
     let Some(value) = headers.get(CONTENT_RANGE) else {
         return Ok(None);
     };

@@ -28,6 +28,8 @@ mod convert;
 mod data_plane;
 mod error;
 mod fetch;
+#[doc(hidden)]
+pub mod fuzz;
 mod http_answer;
 mod jobs;
 mod limits;

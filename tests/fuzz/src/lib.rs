@@ -1,7 +1,7 @@
 //! Every parser of the workspace on damaged files: none panics, and none allocates more than its file justifies.
 //!
-//! [`targets`] are plain functions on bytes; `tests/replay.rs` drives them on the stable toolchain, in CI: the committed
-//! corpus, then a bounded number of mutations of it.
+//! [`targets`] are plain functions on bytes. `tests/replay.rs` drives them on the stable toolchain, in CI: the committed
+//! corpus, then a bounded number of mutations of it. `fuzz/` hands them to libFuzzer.
 //!
 //! Linking this crate makes [`peak_alloc`] the allocator of the process, so that [`replay`] can measure.
 
@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use peak_alloc::PeakAlloc;
+use rayon::{ThreadPool, ThreadPoolBuilder};
 
 pub use mutate::Mutator;
 
@@ -21,6 +22,15 @@ pub use mutate::Mutator;
 static MEMORY: PeakAlloc = PeakAlloc;
 /// Peaks are the process's: one target at a time.
 static MEASURING: Mutex<()> = Mutex::new(());
+
+thread_local! {
+    /// What parsers do in parallel stays on this thread: inputs are small, and waking others takes longer than they do.
+    static ALONE: ThreadPool = ThreadPoolBuilder::new()
+        .num_threads(1)
+        .use_current_thread()
+        .build()
+        .expect("a pool of this thread alone");
+}
 
 /// Where the sequence of mutations starts when `IGN_SEED` does not say so.
 const SEED: u64 = 20_180_711;
@@ -40,6 +50,16 @@ pub struct Target {
     pub bytes_per_byte: usize,
 }
 
+/// The target of this name.
+///
+/// # Panics
+/// When there is none.
+pub fn target(name: &str) -> &'static Target {
+    let mut all = targets::ALL.iter();
+    all.find(|target| target.name == name)
+        .unwrap_or_else(|| panic!("no target {name}"))
+}
+
 /// Runs a target on `seeds` and on mutations of them: 1500, or as many as `IGN_FUZZ` says.
 ///
 /// # Panics
@@ -52,7 +72,7 @@ pub fn replay(target: &Target, seeds: &[Vec<u8>]) {
     };
     assert!(!seeds.is_empty(), "{} has no corpus", target.name);
     // Pools and caches fill up on the first run.
-    (target.run)(&seeds[0]);
+    ALONE.with(|pool| pool.install(|| (target.run)(&seeds[0])));
     for seed in seeds {
         run(target, seed);
     }
@@ -69,7 +89,8 @@ pub fn replay(target: &Target, seeds: &[Vec<u8>]) {
 pub fn run(target: &Target, input: &[u8]) {
     MEMORY.reset_peak_usage();
     let before = MEMORY.current_usage();
-    let outcome = catch_unwind(AssertUnwindSafe(|| (target.run)(input)));
+    let outcome =
+        ALONE.with(|pool| catch_unwind(AssertUnwindSafe(|| pool.install(|| (target.run)(input)))));
     let held = MEMORY.peak_usage().saturating_sub(before);
     let allowed = target.base_bytes + target.bytes_per_byte * input.len();
     let fault = match outcome {

@@ -4,63 +4,92 @@
 //! what a target proves, it proves for what a museum can send.
 
 use std::path::{Component, Path};
+use std::sync::Arc;
 
 use ign_bundle::{BundleError, metrics, pack, proxy, references, weights};
 use ign_events::{Event, JobFile};
-use ign_geometry::read_mesh;
+use ign_geometry::{parse_mesh, parse_points};
+use ign_registry::Registry;
+use object_store::ObjectStoreExt as _;
+use object_store::memory::InMemory;
 
 use crate::Target;
 use crate::captures::{
-    CAMERAS_TXT, Capture, IMAGES_TXT, MESH, NAMES, POINTS_TXT, SIZE, cameras_bin, check, encoded,
-    images_bin, photograph, points_bin,
+    self, CAMERAS_TXT, Capture, IMAGES_TXT, MESH, NAMES, POINTS_TXT, SIZE, cameras_bin, check,
+    encoded, images_bin, points_bin,
 };
 
 /// Import of the capture around the damaged file: photographs, rasters, threads.
 const IMPORT: usize = 4 << 20;
 /// What a decoder may hold beyond its pixels (`photo::decode`), and the capture around.
 const DECODER: usize = (64 << 20) + IMPORT;
+/// A glTF may show one mesh many times, up to a limit of vertices and triangles however small the file is.
+const MESH_LIMIT: usize = 32 << 20;
 /// JSON values: a byte such as a bracket may become a value of 32 bytes in a vector that doubles.
 const JSON: usize = 128;
 
-/// Every target.
-pub const ALL: &[Target] = &[
-    target("colmap_cameras_txt", colmap_cameras_txt, IMPORT, 64),
-    target("colmap_images_txt", colmap_images_txt, IMPORT, 64),
-    target("colmap_points_txt", colmap_points_txt, IMPORT, 64),
-    target("colmap_cameras_bin", colmap_cameras_bin, IMPORT, 64),
-    target("colmap_images_bin", colmap_images_bin, IMPORT, 64),
-    target("colmap_points_bin", colmap_points_bin, IMPORT, 64),
-    target("capture_toml", capture_toml, IMPORT, JSON),
-    target("test_txt", test_txt, IMPORT, 64),
-    target("photograph", picture, DECODER, 64),
-    target("mask", mask, DECODER, 64),
-    // A vertex of 8 bytes of text is 24 of position, with its normal, sums and the vectors' growth 170.
-    target("mesh_ply", mesh_ply, 1 << 20, 64),
-    target("mesh_obj", mesh_obj, 1 << 20, 64),
-    target("bundle_json", bundle_json, 1 << 16, JSON),
-    target("bundle_metrics", bundle_metrics, 1 << 16, JSON),
-    target("bundle_views", bundle_views, 1 << 20, JSON),
-    target("bundle_image", bundle_image, 1 << 20, 64),
-    target("bundle_proxy", bundle_proxy, 1 << 20, 64),
-    target("bundle_weights", bundle_weights, 1 << 16, 64),
-    target("oci_manifest", oci_manifest, 1 << 16, JSON),
-    target("ids", ids, 1 << 16, 16),
-    target("events", events, 1 << 16, JSON),
-    target("job", job, 1 << 16, JSON),
-];
+/// The one list of targets: every parser, the bytes that it may hold at once whatever the input, and those for each byte
+/// of it. The dollar sign is handed in for the macro within.
+macro_rules! targets {
+    ($dollar:tt: $($name:ident, $base:expr, $each:expr;)*) => {
+        /// Every target.
+        pub const ALL: &[Target] = &[$(Target {
+            name: stringify!($name),
+            run: $name,
+            base_bytes: $base,
+            bytes_per_byte: $each,
+        }),*];
 
-const fn target(
-    name: &'static str,
-    run: fn(&[u8]),
-    base_bytes: usize,
-    bytes_per_byte: usize,
-) -> Target {
-    Target {
-        name,
-        run,
-        base_bytes,
-        bytes_per_byte,
-    }
+        /// Calls a macro with the names of all targets.
+        #[macro_export]
+        macro_rules! for_all_targets {
+            ($dollar each:ident) => { $dollar each! { $($name),* } };
+        }
+    };
+}
+
+targets! { $:
+    colmap_cameras_txt, IMPORT, 64;
+    colmap_images_txt, IMPORT, 64;
+    colmap_points_txt, IMPORT, 64;
+    colmap_cameras_bin, IMPORT, 64;
+    colmap_images_bin, IMPORT, 64;
+    colmap_points_bin, IMPORT, 64;
+    transforms_json, IMPORT, JSON;
+    metashape_xml, IMPORT, JSON;
+    reality_capture_csv, IMPORT, JSON;
+    meshroom_sfm, IMPORT, JSON;
+    opensfm_json, IMPORT, JSON;
+    bundler_out, IMPORT, JSON;
+    capture_toml, IMPORT, JSON;
+    test_txt, IMPORT, 64;
+    photograph, DECODER, 64;
+    mask, DECODER, 64;
+    mesh_ply, 1 << 20, 64;
+    mesh_obj, 1 << 20, 64;
+    mesh_stl, 1 << 20, 64;
+    mesh_glb, MESH_LIMIT, JSON;
+    mesh_gltf, MESH_LIMIT, JSON;
+    points_ply, 1 << 20, 64;
+    bundle_json, 1 << 16, JSON;
+    bundle_metrics, 1 << 16, JSON;
+    bundle_views, 1 << 20, JSON;
+    bundle_held_out, 1 << 16, JSON;
+    bundle_image, 1 << 20, 64;
+    bundle_proxy, 1 << 20, 64;
+    bundle_weights, 1 << 16, 64;
+    render_cameras, 1 << 16, JSON;
+    recipe, 1 << 16, JSON;
+    checkpoint, 1 << 16, 64;
+    oci_manifest, 1 << 16, JSON;
+    registry_version, 1 << 20, JSON;
+    registry_state, 1 << 20, JSON;
+    http_headers, 1 << 16, 16;
+    submit_list, 1 << 20, 64;
+    bag, 1 << 20, 64;
+    ids, 1 << 16, 16;
+    events, 1 << 16, JSON;
+    job, 1 << 16, JSON;
 }
 
 thread_local! {
@@ -74,6 +103,7 @@ thread_local! {
         ("sparse/0/images.bin", &images_bin()),
         ("sparse/0/points3D.bin", &points_bin()),
     ]);
+    static CAMERAS: Capture = Capture::new(&[("list.txt", NAMES.join("\n").as_bytes())]);
 }
 
 /// `sparse/0/cameras.txt`.
@@ -121,6 +151,47 @@ fn binary_model(path: &str, bytes: &[u8], sound: &[u8]) {
     });
 }
 
+/// `transforms.json` of nerfstudio and instant-ngp.
+fn transforms_json(bytes: &[u8]) {
+    cameras("transforms.json", bytes);
+}
+
+/// Metashape's cameras.
+fn metashape_xml(bytes: &[u8]) {
+    cameras("cameras.xml", bytes);
+}
+
+/// `RealityCapture`'s registration.
+fn reality_capture_csv(bytes: &[u8]) {
+    cameras("cameras.csv", bytes);
+}
+
+/// Meshroom's `sfm.json`, `cameras.sfm`.
+fn meshroom_sfm(bytes: &[u8]) {
+    cameras("cameras.sfm", bytes);
+}
+
+/// `OpenSfM`'s `reconstruction.json`.
+fn opensfm_json(bytes: &[u8]) {
+    cameras("reconstruction.json", bytes);
+}
+
+/// `bundle.out`, beside a sound `list.txt`.
+fn bundler_out(bytes: &[u8]) {
+    cameras("bundle.out", bytes);
+}
+
+/// A file of cameras by itself, and as the only reconstruction of a capture.
+fn cameras(path: &str, bytes: &[u8]) {
+    let photographs = NAMES.map(|name| (name.to_owned(), SIZE));
+    let (format, faults) = ign_capture::check_cameras(bytes, &photographs);
+    assert!(format.is_some() || !faults.is_empty());
+    CAMERAS.with(|capture| {
+        capture.import_with(path, bytes);
+        std::fs::remove_file(capture.dir().join(path)).expect("there");
+    });
+}
+
 /// `capture.toml`.
 fn capture_toml(bytes: &[u8]) {
     text_model("capture.toml", bytes, "");
@@ -132,9 +203,9 @@ fn test_txt(bytes: &[u8]) {
 }
 
 /// A photograph: its header at import, its pixels when the view is loaded. It may change in between.
-fn picture(bytes: &[u8]) {
+fn photograph(bytes: &[u8]) {
     replaced("images/a.png", bytes);
-    COLMAP_TEXT.with(|capture| capture.write("images/a.png", &photograph(0)));
+    COLMAP_TEXT.with(|capture| capture.write("images/a.png", &captures::photograph(0)));
 }
 
 /// A mask, likewise.
@@ -175,23 +246,42 @@ fn mesh_obj(bytes: &[u8]) {
     mesh("mesh.obj", bytes);
 }
 
-thread_local! {
-    static MESHES: tempfile::TempDir = tempfile::TempDir::with_prefix("ign-fuzz-").expect("a folder");
+/// `mesh.stl`.
+fn mesh_stl(bytes: &[u8]) {
+    mesh("mesh.stl", bytes);
+}
+
+/// `mesh.glb`.
+fn mesh_glb(bytes: &[u8]) {
+    mesh("mesh.glb", bytes);
+}
+
+/// `mesh.gltf`, with the same 172 bytes in whatever file it names.
+fn mesh_gltf(bytes: &[u8]) {
+    mesh("mesh.gltf", bytes);
 }
 
 fn mesh(name: &str, bytes: &[u8]) {
-    MESHES.with(|folder| {
-        let path = folder.path().join(name);
-        std::fs::write(&path, bytes).expect("a file");
-        if let Ok(mesh) = read_mesh(&path) {
-            check_mesh(&mesh);
-            let (center, radius) = mesh.bounding_sphere();
-            assert!(
-                center.is_finite() && radius.is_finite(),
-                "{center} {radius}"
-            );
-        }
-    });
+    let beside = |path: &Path| {
+        let plain = |part| matches!(part, Component::Normal(_) | Component::CurDir);
+        assert!(path.components().all(plain), "{}", path.display());
+        Ok(vec![0x3f; 172])
+    };
+    if let Ok(mesh) = parse_mesh(Path::new(name), bytes, &beside) {
+        check_mesh(&mesh);
+        let (center, radius) = mesh.bounding_sphere();
+        assert!(
+            center.is_finite() && radius.is_finite(),
+            "{center} {radius}"
+        );
+    }
+}
+
+/// A file of points: `ply_file_path` of `transforms.json`.
+fn points_ply(bytes: &[u8]) {
+    for (position, _) in parse_points(bytes).into_iter().flatten() {
+        assert!(position.is_finite(), "{position}");
+    }
 }
 
 fn check_mesh(mesh: &ign_geometry::Mesh) {
@@ -226,6 +316,13 @@ fn bundle_views(bytes: &[u8]) {
     let image = image::RgbaImage::from_pixel(SIZE.0, SIZE.1, image::Rgba([9, 8, 7, 255]));
     let image = encoded(&image.into(), image::ImageFormat::Png);
     views(bytes, &|_| Ok(image.clone()));
+}
+
+/// `held_out/views.json`.
+fn bundle_held_out(bytes: &[u8]) {
+    for view in references::decode_held_out(bytes).into_iter().flatten() {
+        view.camera.intrinsics.validate().expect("a valid camera");
+    }
 }
 
 /// An image of a bundle, by a sound `references/views.json`.
@@ -281,6 +378,24 @@ fn bundle_weights(bytes: &[u8]) {
     }
 }
 
+/// The file of `ign-worker render --cameras`.
+fn render_cameras(bytes: &[u8]) {
+    for (name, camera) in ign_render::parse_cameras(bytes).into_iter().flatten() {
+        camera.intrinsics.validate().expect("valid intrinsics");
+        assert!(camera.camera_from_world.is_finite(), "{name}");
+    }
+}
+
+/// A recipe, as jobs carry it.
+fn recipe(bytes: &[u8]) {
+    ign_bake::fuzz::recipe(bytes);
+}
+
+/// A checkpoint of training.
+fn checkpoint(bytes: &[u8]) {
+    ign_bake::fuzz::checkpoint(bytes);
+}
+
 /// Manifests of captures and bundles.
 fn oci_manifest(bytes: &[u8]) {
     if let Ok(manifest) = ign_proto::Manifest::decode(bytes) {
@@ -292,7 +407,68 @@ fn oci_manifest(bytes: &[u8]) {
     }
 }
 
-/// Identifiers, digests and paths.
+/// The bucket's record of a version.
+fn registry_version(bytes: &[u8]) {
+    rebuild("versions/museum/vase/v1.json", bytes);
+}
+
+/// The bucket's record of an object's aliases and retired versions.
+fn registry_state(bytes: &[u8]) {
+    rebuild("versions/museum/vase/state.json", bytes);
+}
+
+/// Reads a bucket back that holds one record.
+fn rebuild(path: &str, bytes: &[u8]) {
+    let store = Arc::new(InMemory::new());
+    let rebuilt = futures::executor::block_on(async {
+        store.put(&path.into(), bytes.to_vec().into()).await?;
+        let registry = Registry::on(store).await.expect("a working store");
+        Ok::<_, object_store::Error>(registry.rebuild().await)
+    });
+    let rebuilt = rebuilt.expect("stored").expect("read");
+    // No manifest is there: a version is a fault whatever it says.
+    assert!(rebuilt.versions.is_empty());
+    assert_eq!(rebuilt.faults.len() + rebuilt.states.len(), 1);
+}
+
+/// Headers of requests: tokens and ranges.
+fn http_headers(bytes: &[u8]) {
+    ign_coordinator::fuzz::header(&String::from_utf8_lossy(bytes), 1000);
+}
+
+thread_local! {
+    static FOLDER: tempfile::TempDir = tempfile::TempDir::with_prefix("ign-fuzz-").expect("a folder");
+}
+
+/// The list of `ignctl submit --manifest`.
+fn submit_list(bytes: &[u8]) {
+    FOLDER.with(|folder| {
+        let path = folder.path().join("list.csv");
+        std::fs::write(&path, bytes).expect("a file");
+        ignctl::fuzz::list(&path);
+    });
+}
+
+/// The payload manifest of a `BagIt` bag of one file.
+fn bag(bytes: &[u8]) {
+    FOLDER.with(|folder| {
+        let bag = folder.path().join("bag");
+        let write = |path: &str, bytes: &[u8]| {
+            let path = bag.join(path);
+            std::fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+            std::fs::write(path, bytes).expect("a file");
+        };
+        write(
+            "bagit.txt",
+            b"BagIt-Version: 1.0\nTag-File-Character-Encoding: UTF-8\n",
+        );
+        write("data/images/a 100%.png", b"abc");
+        write("manifest-sha256.txt", bytes);
+        ignctl::fuzz::bag(&bag);
+    });
+}
+
+/// Identifiers, digests, grants and paths.
 fn ids(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else {
         return;
@@ -314,6 +490,8 @@ fn ids(bytes: &[u8]) {
         text.parse::<ign_proto::Digest>().map(|id| id.to_string()),
         text.parse::<ign_proto::ObjectName>()
             .map(|id| id.to_string()),
+        text.parse::<ign_proto::Grant>()
+            .map(|grant| grant.to_string()),
     ] {
         assert!(parsed.is_err() || parsed.is_ok_and(|parsed| parsed == text));
     }
@@ -347,7 +525,8 @@ pub fn seeds() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let gray = image::DynamicImage::from(picture.to_luma8());
     let deep = image::DynamicImage::from(picture.to_rgb16());
     let png = |picture: &image::DynamicImage| encoded(picture, image::ImageFormat::Png);
-    let mesh = mesh_from(MESH);
+    let nothing_beside = |_: &Path| Err(std::io::ErrorKind::NotFound.into());
+    let mesh = parse_mesh(Path::new("mesh.ply"), MESH.as_bytes(), &nothing_beside).expect("a mesh");
     let weights = ign_bundle::Tensors::from([(
         "stem.weight".to_owned(),
         ign_bundle::Tensor {
@@ -425,14 +604,6 @@ pub fn seeds() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         ("events", "all.jsonl", EVENTS.into()),
         ("job", "job.json", JOB.into()),
     ]
-}
-
-fn mesh_from(ply: &str) -> ign_geometry::Mesh {
-    MESHES.with(|folder| {
-        let path = folder.path().join("seed.ply");
-        std::fs::write(&path, ply).expect("a file");
-        read_mesh(&path).expect("a mesh")
-    })
 }
 
 /// A PNG whose header says 60,000 by 60,000 pixels.

@@ -1,47 +1,30 @@
 //! Every target on its corpus and on mutations of it, on the stable toolchain.
 
-use ign_fuzz::{corpus, replay, targets};
+use ign_fuzz::{corpus, replay, target};
 
 macro_rules! replays {
-    ($($name:ident),* $(,)?) => {
+    ($($name:ident),*) => {
         $(#[test]
         fn $name() {
-            let target = targets::ALL.iter().find(|target| target.name == stringify!($name));
-            let target = target.expect("a target");
+            let target = target(stringify!($name));
             replay(target, &corpus(target));
         })*
-
-        #[test]
-        fn every_target_is_replayed() {
-            let replayed = [$(stringify!($name)),*];
-            for target in targets::ALL {
-                assert!(replayed.contains(&target.name), "{}", target.name);
-            }
-        }
     };
 }
 
-replays!(
-    colmap_cameras_txt,
-    colmap_images_txt,
-    colmap_points_txt,
-    colmap_cameras_bin,
-    colmap_images_bin,
-    colmap_points_bin,
-    capture_toml,
-    test_txt,
-    photograph,
-    mask,
-    mesh_ply,
-    mesh_obj,
-    bundle_json,
-    bundle_metrics,
-    bundle_views,
-    bundle_image,
-    bundle_proxy,
-    bundle_weights,
-    oci_manifest,
-    ids,
-    events,
-    job,
-);
+ign_fuzz::for_all_targets!(replays);
+
+/// `cargo fuzz` finds the targets in the manifest of its crate.
+#[test]
+fn cargo_fuzz_has_a_binary_for_every_target() {
+    let manifest = include_str!("../fuzz/Cargo.toml");
+    let binaries: Vec<&str> = manifest
+        .lines()
+        .filter_map(|line| line.trim().strip_prefix("{ name = \"")?.split('"').next())
+        .collect();
+    let targets: Vec<&str> = ign_fuzz::targets::ALL
+        .iter()
+        .map(|target| target.name)
+        .collect();
+    assert_eq!(binaries, targets);
+}

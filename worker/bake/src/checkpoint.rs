@@ -31,6 +31,8 @@ const OBSERVATIONS: u64 = 8;
 const MAX_FALLBACKS: u32 = 4;
 /// Factor of the learning rate at every fallback.
 const SLOWER: f64 = 0.25;
+/// More steps than any stage trains; what a checkpoint counts stays below.
+const MAX_COUNT: u64 = 1 << 40;
 
 /// Weights by name: shape and values.
 type Weights = BTreeMap<String, (Vec<i64>, Vec<f32>)>;
@@ -484,40 +486,72 @@ impl<'a> Session<'a> {
             path: path.to_owned(),
             source,
         })?;
-        let (_, header) = SafeTensors::read_metadata(&data).map_err(|e| unusable(path, &e))?;
-        let json = header.metadata().as_ref().and_then(|map| map.get(META_KEY));
-        let meta: Meta =
-            serde_json::from_str(json.ok_or_else(|| unusable(path, &"it has no header"))?)
-                .map_err(|e| unusable(path, &e))?;
-        if meta.schema != SCHEMA
-            || meta.recipe != self.meta.recipe
-            || meta.capture != self.meta.capture
+        let stored = parse(&data).map_err(|reason| unusable(path, &reason))?;
+        if stored.meta.recipe != self.meta.recipe || stored.meta.capture != self.meta.capture {
+            return Err(unusable(path, &"it belongs to another recipe or capture"));
+        }
+        (self.meta, self.weights, self.resumed) = (stored.meta, stored.weights, stored.resumed);
+        Ok(())
+    }
+}
+
+/// What a checkpoint file holds.
+pub(crate) struct Stored {
+    meta: Meta,
+    weights: BTreeMap<String, Weights>,
+    resumed: Option<Snapshot>,
+}
+
+/// Reads a checkpoint file, which another machine may have written.
+///
+/// # Errors
+/// Why it is none: another schema, figures out of range, tensors that are absent, not f32 or not finite.
+pub(crate) fn parse(data: &[u8]) -> Result<Stored, String> {
+    let file = SafeTensors::deserialize(data).map_err(|error| error.to_string())?;
+    let (_, header) = SafeTensors::read_metadata(data).map_err(|error| error.to_string())?;
+    let json = header.metadata().as_ref().and_then(|map| map.get(META_KEY));
+    let meta: Meta =
+        serde_json::from_str(json.ok_or("it has no header")?).map_err(|error| error.to_string())?;
+    if meta.schema != SCHEMA {
+        return Err(format!("its schema is {:?}", meta.schema));
+    }
+    let mut secs = meta.secs.values();
+    if !secs.all(|secs| secs.is_finite() && *secs >= 0.0)
+        || meta
+            .current
+            .as_ref()
+            .is_some_and(|current| !current.holds())
+    {
+        return Err("its times or counts are out of range".into());
+    }
+    let values = |name: &str| -> Result<(Vec<i64>, Vec<f32>), String> {
+        let view = file.tensor(name).map_err(|error| error.to_string())?;
+        if view.dtype() != Dtype::F32 {
+            return Err(format!("tensor {name} is not f32"));
+        }
+        let values = floats(view.data());
+        if !values.iter().all(|value| value.is_finite()) {
+            return Err(format!("tensor {name} is not finite"));
+        }
+        Ok((view.shape().iter().map(|&n| n as i64).collect(), values))
+    };
+    let mut weights: BTreeMap<String, Weights> = BTreeMap::new();
+    for name in file.names() {
+        if let Some((stage, tensor)) = name
+            .strip_prefix("finished/")
+            .and_then(|rest| rest.split_once('/'))
         {
-            return Err(unusable(
-                path,
-                &"it belongs to another recipe, capture or version",
-            ));
+            weights
+                .entry(stage.into())
+                .or_default()
+                .insert(tensor.into(), values(name)?);
         }
-        let file = SafeTensors::deserialize(&data).map_err(|e| unusable(path, &e))?;
-        let values = |name: &str| -> Result<(Vec<i64>, Vec<f32>), BakeError> {
-            let view = file.tensor(name).map_err(|e| unusable(path, &e))?;
-            let shape = view.shape().iter().map(|&n| n as i64).collect();
-            Ok((shape, floats(view.data())))
-        };
-        let mut weights: BTreeMap<String, Weights> = BTreeMap::new();
-        for name in file.names() {
-            if let Some((stage, tensor)) = name
-                .strip_prefix("finished/")
-                .and_then(|rest| rest.split_once('/'))
-            {
-                weights
-                    .entry(stage.into())
-                    .or_default()
-                    .insert(tensor.into(), values(name)?);
-            }
-        }
-        let mut resumed = None;
-        if let Some(current) = &meta.current {
+    }
+    let resumed = match &meta.current {
+        Some(current) => {
+            let part = |index: usize, name: &str| {
+                values(&format!("current/{index}/{name}")).map(|(_, values)| values)
+            };
             let mut snapshot = Snapshot {
                 flat: Vec::new(),
                 adam: Vec::new(),
@@ -527,21 +561,37 @@ impl<'a> Session<'a> {
                 snapshot.best = Some(values("current/best")?.1);
             }
             for (index, &steps) in current.adam_steps.iter().enumerate() {
-                let part = |name: &str| {
-                    values(&format!("current/{index}/{name}")).map(|(_, values)| values)
-                };
-                snapshot.flat.push(part("flat")?);
+                snapshot.flat.push(part(index, "flat")?);
                 snapshot.adam.push(AdamState {
-                    first: part("first")?,
-                    second: part("second")?,
-                    average: part("average")?,
+                    first: part(index, "first")?,
+                    second: part(index, "second")?,
+                    average: part(index, "average")?,
                     steps,
                 });
             }
-            resumed = Some(snapshot);
+            Some(snapshot)
         }
-        (self.meta, self.weights, self.resumed) = (meta, weights, resumed);
-        Ok(())
+        None => None,
+    };
+    Ok(Stored {
+        meta,
+        weights,
+        resumed,
+    })
+}
+
+impl Current {
+    /// Whether training can go on from these figures.
+    fn holds(&self) -> bool {
+        let counts = [self.step, self.observed, self.fallbacks.into()];
+        counts
+            .iter()
+            .chain(&self.adam_steps)
+            .all(|count| *count <= MAX_COUNT)
+            && self.elapsed_secs.is_finite()
+            && self.elapsed_secs >= 0.0
+            && self.rate_scale > 0.0
+            && self.rate_scale <= 1.0
     }
 }
 

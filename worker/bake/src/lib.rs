@@ -14,6 +14,8 @@ mod effects;
 mod error;
 mod evaluate;
 pub mod experiment;
+#[doc(hidden)]
+pub mod fuzz;
 mod pack;
 mod progress;
 mod recipe;

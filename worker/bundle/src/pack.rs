@@ -255,9 +255,7 @@ impl Bundle {
         if !self.lists(HELD_OUT_VIEWS_FILE) {
             return Ok(Vec::new());
         }
-        serde_json::from_slice::<HeldOutViews>(&self.read(HELD_OUT_VIEWS_FILE)?)
-            .map_err(BundleError::json(HELD_OUT_VIEWS_FILE))?
-            .checked()
+        references::decode_held_out(&self.read(HELD_OUT_VIEWS_FILE)?)
     }
 
     fn lists(&self, path: &str) -> bool {

@@ -130,7 +130,7 @@ impl HeldOutViews {
         }
     }
 
-    pub(crate) fn checked(self) -> Result<Vec<HeldOutView>, BundleError> {
+    fn checked(self) -> Result<Vec<HeldOutView>, BundleError> {
         let view = |record: HeldOutRecord| {
             let bad = |reason: String| {
                 BundleError::malformed(
@@ -151,6 +151,16 @@ impl HeldOutViews {
         };
         self.views.into_iter().map(view).collect()
     }
+}
+
+/// Reads `held_out/views.json`.
+///
+/// # Errors
+/// It is no such list, or a camera or an exposure in it is none.
+pub fn decode_held_out(json: &[u8]) -> Result<Vec<HeldOutView>, BundleError> {
+    serde_json::from_slice::<HeldOutViews>(json)
+        .map_err(BundleError::json(crate::HELD_OUT_VIEWS_FILE))?
+        .checked()
 }
 
 /// Where reference number `index` lies in a bundle.
@@ -231,25 +241,21 @@ pub fn decode(
             let camera = Camera::new(record.intrinsics, from_rows(&record.camera_from_world))
                 .map_err(|source| bad(source.to_string()))?;
             let bytes = read(&record.file)?;
-            check_size(&record.file, &bytes)?;
+            // By its header: an image of another size is refused before memory is taken for it.
+            let (width, height) = check_size(&record.file, &bytes)?;
+            if [width, height] != record.size {
+                let [said_width, said_height] = record.size;
+                return Err(BundleError::malformed(
+                    record.file,
+                    format!("{width}x{height} pixels, views.json says {said_width}x{said_height}"),
+                ));
+            }
             let image = image::load_from_memory_with_format(&bytes, ImageFormat::Png)
                 .map_err(|source| BundleError::Image {
                     file: record.file.clone(),
                     source,
                 })?
                 .into_rgba8();
-            if [image.width(), image.height()] != record.size {
-                return Err(BundleError::malformed(
-                    record.file,
-                    format!(
-                        "{}x{} pixels, views.json says {}x{}",
-                        image.width(),
-                        image.height(),
-                        record.size[0],
-                        record.size[1]
-                    ),
-                ));
-            }
             Ok(Reference {
                 name: record.name,
                 camera,

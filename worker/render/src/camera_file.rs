@@ -13,12 +13,51 @@
 //! top-left corner, so that the centre of the first pixel lies at (0.5, 0.5), as in COLMAP. `name` becomes the file
 //! name of the image.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail, ensure};
 use glam::{DAffine3, DMat3, DVec3};
-use ign_geometry::{Camera, CameraIntrinsics};
+use ign_geometry::{Camera, CameraError, CameraIntrinsics};
 use serde::Deserialize;
+
+/// Longest side of an image, in pixels.
+const MAX_SIDE: u32 = 16384;
+
+/// Why a camera file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum CameraFileError {
+    /// The file cannot be read.
+    #[error("cannot read the camera file {path}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// It is no list of cameras.
+    #[error("the camera file is not of the documented form")]
+    Json(#[from] serde_json::Error),
+    /// The list is empty.
+    #[error("the camera file lists no cameras")]
+    Empty,
+    /// A camera that is none.
+    #[error("camera {name:?} cannot be used")]
+    Camera {
+        /// Its name in the file.
+        name: String,
+        /// What is wrong with it.
+        #[source]
+        source: CameraError,
+    },
+    /// A matrix of another form, or an image too large.
+    #[error("camera {name:?}: {reason}")]
+    Entry {
+        /// Its name in the file.
+        name: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -34,30 +73,56 @@ struct Entry {
 }
 
 /// Names and cameras (world frame) of a camera file.
-pub(crate) fn read(path: &Path) -> Result<Vec<(String, Camera)>> {
-    let text = std::fs::read_to_string(path)
-        .with_context(|| format!("cannot read the camera file {}", path.display()))?;
-    parse(&text).with_context(|| format!("camera file {}", path.display()))
+///
+/// # Errors
+/// The file cannot be read, or as [`parse_cameras`].
+pub fn read_cameras(path: &Path) -> Result<Vec<(String, Camera)>, CameraFileError> {
+    let json = std::fs::read(path).map_err(|source| CameraFileError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    parse_cameras(&json)
 }
 
-fn parse(text: &str) -> Result<Vec<(String, Camera)>> {
-    let entries: Vec<Entry> = serde_json::from_str(text)?;
-    ensure!(!entries.is_empty(), "it lists no cameras");
+/// Names and cameras (world frame) of a camera file's content.
+///
+/// # Errors
+/// The content is not of the form above, or names the camera that cannot be used and says why.
+pub fn parse_cameras(json: &[u8]) -> Result<Vec<(String, Camera)>, CameraFileError> {
+    let entries: Vec<Entry> = serde_json::from_slice(json)?;
+    if entries.is_empty() {
+        return Err(CameraFileError::Empty);
+    }
     entries
         .into_iter()
-        .map(|entry| {
-            let name = entry.name.clone();
-            let camera = camera(&entry).with_context(|| format!("camera {name:?}"))?;
-            Ok((name, camera))
-        })
+        .map(|entry| Ok((entry.name.clone(), camera(entry)?)))
         .collect()
 }
 
-fn camera(entry: &Entry) -> Result<Camera> {
+fn camera(entry: Entry) -> Result<Camera, CameraFileError> {
+    let refused = |reason: String| CameraFileError::Entry {
+        name: entry.name.clone(),
+        reason,
+    };
+    if entry.width.max(entry.height) > MAX_SIDE {
+        return Err(refused(format!(
+            "its image has {}x{} pixels, at most {MAX_SIDE} on a side can be rendered",
+            entry.width, entry.height
+        )));
+    }
     let [x, y, z] = match entry.camera_from_world.as_slice() {
         [x, y, z] | [x, y, z, [0.0, 0.0, 0.0, 1.0]] => [x, y, z],
-        [_, _, _, _] => bail!("the fourth row of camera_from_world is not 0 0 0 1"),
-        rows => bail!("camera_from_world has {} rows, expected 3 or 4", rows.len()),
+        [_, _, _, _] => {
+            return Err(refused(
+                "the fourth row of camera_from_world is not 0 0 0 1".into(),
+            ));
+        }
+        rows => {
+            return Err(refused(format!(
+                "camera_from_world has {} rows, expected 3 or 4",
+                rows.len()
+            )));
+        }
     };
     let row = |row: &[f64; 4]| DVec3::new(row[0], row[1], row[2]);
     let camera_from_world = DAffine3 {
@@ -72,7 +137,10 @@ fn camera(entry: &Entry) -> Result<Camera> {
         width: entry.width,
         height: entry.height,
     };
-    Ok(Camera::new(intrinsics, camera_from_world)?)
+    Camera::new(intrinsics, camera_from_world).map_err(|source| CameraFileError::Camera {
+        name: entry.name,
+        source,
+    })
 }
 
 #[cfg(test)]
@@ -92,7 +160,7 @@ mod tests {
             "[[0,-1,0,1],[1,0,0,2],[0,0,1,3]]",
             "[[0,-1,0,1],[1,0,0,2],[0,0,1,3],[0,0,0,1]]",
         ] {
-            let cameras = parse(&entry(matrix)).unwrap();
+            let cameras = parse_cameras(entry(matrix).as_bytes()).unwrap();
             let camera = cameras[0].1;
             let in_camera = camera.camera_from_world.transform_point3(DVec3::X);
             assert!(in_camera.distance(DVec3::new(1.0, 3.0, 3.0)) < 1e-12);
@@ -114,9 +182,15 @@ mod tests {
                 "fourth row",
             ),
             (entry("[[2,0,0,0],[0,1,0,0],[0,0,1,0]]"), "camera \"a\""),
+            (
+                entry("[[1,0,0,0],[0,1,0,0],[0,0,1,0]]").replace('6', "4294967295"),
+                "4294967295x4 pixels",
+            ),
         ] {
-            let error = format!("{:#}", parse(&text).unwrap_err());
-            assert!(error.contains(message), "{error}");
+            let error = parse_cameras(text.as_bytes()).unwrap_err();
+            let source = std::error::Error::source(&error).map(ToString::to_string);
+            let said = format!("{error}: {}", source.unwrap_or_default());
+            assert!(said.contains(message), "{said}");
         }
     }
 }

@@ -7,6 +7,7 @@
 
 mod baselines;
 mod bundle;
+mod camera_file;
 mod model;
 mod references;
 mod settings;
@@ -16,6 +17,7 @@ mod translation;
 
 pub use baselines::{debevec_ibr, naive_ibr};
 pub use bundle::{BundleRenderer, NetworkFiles, RenderError, orbit};
+pub use camera_file::{CameraFileError, parse_cameras, read_cameras};
 pub use model::{Composition, Effects, Model};
 pub use references::{ReferenceImage, References, Warped};
 pub use settings::{CoverageRule, Recipe, RenderSettings};
