@@ -187,7 +187,7 @@ impl Target {
     }
 }
 
-/// Adds the token to each gRPC call.
+/// Adds the token to each gRPC call, and the trace that the command began.
 #[derive(Clone)]
 pub(crate) struct Bearer(MetadataValue<Ascii>);
 
@@ -199,6 +199,11 @@ impl tonic::service::Interceptor for Bearer {
         request
             .metadata_mut()
             .insert("authorization", self.0.clone());
+        if let Some(trace) = ign_trace::current()
+            && let Ok(trace) = trace.to_string().parse()
+        {
+            request.metadata_mut().insert(ign_trace::HEADER, trace);
+        }
         Ok(request)
     }
 }

@@ -10,11 +10,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::Duration;
 
-use ign_coordinator::Running;
+use ign_coordinator::{Care, Running};
 use ign_registry::StoreConfig;
+use ign_trace::Exporter;
 use tokio::sync::{oneshot, watch};
 use tokio::task::{JoinHandle, JoinSet};
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{EnvFilter, Layer as _};
 
 use crate::connection::Target;
 use crate::problem::{Doing as _, Problem, chain};
@@ -30,6 +33,10 @@ pub(crate) struct Options {
     pub(crate) listen: SocketAddr,
     /// Something in front speaks TLS: listening beyond this machine is fine.
     pub(crate) behind_tls_proxy: bool,
+    /// What keeps the store sound.
+    pub(crate) care: Care,
+    /// Receivers of webhooks inside, `host:port`.
+    pub(crate) webhook_internal: Vec<String>,
     /// Whether this is a bake's own service: workers that keep dying end it, and the coordinator logs to a file.
     pub(crate) own: bool,
 }
@@ -43,6 +50,8 @@ pub(crate) struct Embedded {
     workers: JoinSet<Result<(), Problem>>,
     stop_coordinator: Option<oneshot::Sender<()>>,
     coordinator: JoinHandle<Result<(), Problem>>,
+    /// Sends the last spans when all has ended.
+    _exporter: Option<Exporter>,
     _lock: File,
 }
 
@@ -54,7 +63,7 @@ impl Embedded {
         let logs = data.join("logs");
         std::fs::create_dir_all(&logs).doing("cannot create the data folder", data.display())?;
         let lock = take_lock(&data)?;
-        log(options.own.then(|| logs.join("coordinator.log")).as_deref())?;
+        let exporter = log(options.own.then(|| logs.join("coordinator.log")).as_deref())?;
         let program = match options.workers {
             0 => PathBuf::new(),
             _ => supervise::find_worker()?,
@@ -115,6 +124,7 @@ impl Embedded {
             workers,
             stop_coordinator: Some(stop_coordinator),
             coordinator,
+            _exporter: exporter,
             _lock: lock,
         })
     }
@@ -198,7 +208,8 @@ async fn start_coordinator(
         tls: None,
         behind_tls_proxy: options.behind_tls_proxy,
         limits: ign_coordinator::Limits::default(),
-        care: ign_coordinator::Care::default(),
+        care: options.care.clone(),
+        webhook_internal: options.webhook_internal.clone(),
     };
     let shutdown = async {
         // Asked to stop, or the service was dropped: both mean stop.
@@ -209,20 +220,26 @@ async fn start_coordinator(
         .map_err(|error| Problem::failed(chain(&error)).at(data.display()))
 }
 
-/// Sends the coordinator's log to a file, or to stderr; `IGN_LOG` sets the level.
-fn log(file: Option<&Path>) -> Result<(), Problem> {
+/// Sends the coordinator's log to a file, or to stderr; `IGN_LOG` sets the level. Its spans go where
+/// `OTEL_EXPORTER_OTLP_ENDPOINT` says, until what is returned is dropped.
+fn log(file: Option<&Path>) -> Result<Option<Exporter>, Problem> {
     let level = if file.is_some() { "info" } else { "warn" };
     let filter = EnvFilter::try_from_env("IGN_LOG").unwrap_or_else(|_unset| EnvFilter::new(level));
-    let log = tracing_subscriber::fmt()
-        .with_ansi(false)
-        .with_env_filter(filter);
-    let begun = match file {
+    let log = tracing_subscriber::fmt::layer().with_ansi(false);
+    let log = match file {
         Some(path) => log
             .with_writer(Mutex::new(supervise::open_log(path)?))
-            .try_init(),
-        None => log.with_writer(std::io::stderr).try_init(),
+            .boxed(),
+        None => log.with_writer(std::io::stderr).boxed(),
     };
-    begun.map_err(|error| Problem::failed(format!("cannot begin the log: {error}")))
+    let exporter =
+        Exporter::from_env("ign-coordinator").map_err(|error| Problem::usage(chain(&error)))?;
+    tracing_subscriber::registry()
+        .with(log.with_filter(filter))
+        .with(exporter.as_ref().map(Exporter::layer))
+        .try_init()
+        .map_err(|error| Problem::failed(format!("cannot begin the log: {error}")))?;
+    Ok(exporter)
 }
 
 fn take_lock(data: &Path) -> Result<File, Problem> {

@@ -27,14 +27,15 @@ mod watch;
 use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser};
+use ign_trace::{Exporter, Span, TraceParent};
 
 use crate::commands::{
     admin, bake, bundle, collections, completions, doctor, jobs, preflight, report, status, submit,
-    token, up,
+    token, up, webhook, worker,
 };
 use crate::connection::ConnectionArgs;
 use crate::output::Format;
-use crate::problem::{Exit, Problem};
+use crate::problem::{Exit, Problem, chain};
 
 /// Bakes captures of objects into model bundles, and keeps an eye on it
 #[derive(Debug, Parser)]
@@ -89,6 +90,12 @@ enum Command {
     /// Set shares and limits of collections, pause and resume them
     #[command(subcommand)]
     Collections(collections::Command),
+    /// Have the ends of a collection's jobs sent to a URL, and see what became of it
+    #[command(subcommand)]
+    Webhook(webhook::Command),
+    /// List workers, drain them before maintenance, and take that back
+    #[command(subcommand)]
+    Worker(worker::Command),
     /// Look at model bundles, fetch and verify them
     #[command(subcommand)]
     Bundle(bundle::Command),
@@ -104,6 +111,34 @@ enum Command {
     Doctor(doctor::Args),
     /// Print completions for a shell
     Completions(completions::Args),
+}
+
+impl Command {
+    /// Its name, as spans have it.
+    fn name(&self) -> &'static str {
+        match self {
+            Self::Up(_) => "ignctl up",
+            Self::Bake(_) => "ignctl bake",
+            Self::Preflight(_) => "ignctl preflight",
+            Self::Report(_) => "ignctl report",
+            Self::Submit(_) => "ignctl submit",
+            Self::Status(_) => "ignctl status",
+            Self::Jobs(_) => "ignctl jobs",
+            Self::Logs(_) => "ignctl logs",
+            Self::Cancel(_) => "ignctl cancel",
+            Self::Retry(_) => "ignctl retry",
+            Self::Rebake(_) => "ignctl rebake",
+            Self::Wait(_) => "ignctl wait",
+            Self::Collections(_) => "ignctl collections",
+            Self::Webhook(_) => "ignctl webhook",
+            Self::Worker(_) => "ignctl worker",
+            Self::Bundle(_) => "ignctl bundle",
+            Self::Token(_) => "ignctl token",
+            Self::Admin(_) => "ignctl admin",
+            Self::Doctor(_) => "ignctl doctor",
+            Self::Completions(_) => "ignctl completions",
+        }
+    }
 }
 
 /// What every command gets.
@@ -143,7 +178,22 @@ fn start(cli: Cli) -> Result<(), Problem> {
         .enable_all()
         .build()
         .map_err(|error| Problem::failed(format!("cannot start: {error}")))?;
-    let outcome = runtime.block_on(Box::pin(run(cli)));
+    let exporter = Exporter::from_env("ignctl").map_err(|error| Problem::usage(chain(&error)))?;
+    let mut span = exporter
+        .as_ref()
+        .map(|exporter| exporter.span(cli.command.name(), None));
+    // Jobs are found by it later, also where nobody exports anything.
+    let trace = span
+        .as_ref()
+        .and_then(Span::traceparent)
+        .unwrap_or_else(TraceParent::random);
+    let work = ign_trace::within(tracing::Span::none(), Some(trace), run(cli));
+    let outcome = runtime.block_on(Box::pin(work));
+    if let (Some(span), Err(problem)) = (&mut span, &outcome) {
+        span.failed(problem.what.clone());
+    }
+    drop(span);
+    drop(exporter);
     // Reads of a terminal or hashing must not hold the exit.
     runtime.shutdown_background();
     outcome
@@ -167,6 +217,8 @@ async fn run(cli: Cli) -> Result<(), Problem> {
         Command::Rebake(args) => jobs::rebake(&context, &args).await,
         Command::Wait(args) => jobs::wait(&context, &args).await,
         Command::Collections(command) => collections::run(&context, &command).await,
+        Command::Webhook(command) => webhook::run(&context, &command).await,
+        Command::Worker(command) => worker::run(&context, &command).await,
         Command::Bundle(command) => bundle::run(&context, &command).await,
         Command::Report(args) => report::run(&context, &args).await,
         Command::Token(command) => token::run(&context, &command).await,

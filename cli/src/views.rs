@@ -5,6 +5,7 @@
 
 use chrono::{DateTime, Utc};
 use ign_proto::v1;
+use ign_trace::TraceParent;
 use serde::Serialize;
 use serde_json::Value;
 
@@ -29,6 +30,7 @@ pub(crate) struct JobView {
     pub(crate) capture_digest: String,
     pub(crate) recipe: Value,
     pub(crate) checkpoint_digest: Option<String>,
+    pub(crate) trace_id: Option<String>,
     pub(crate) submitted_at: Option<DateTime<Utc>>,
     pub(crate) started_at: Option<DateTime<Utc>>,
     pub(crate) finished_at: Option<DateTime<Utc>>,
@@ -182,6 +184,11 @@ impl From<&v1::Job> for JobView {
             capture_digest: spec.capture_digest,
             recipe: embedded(&spec.recipe_json),
             checkpoint_digest: some(&job.checkpoint_digest),
+            trace_id: job
+                .traceparent
+                .parse()
+                .ok()
+                .map(|trace: TraceParent| trace.trace_id()),
             submitted_at: time(job.submitted_at.as_ref()),
             started_at: time(job.started_at.as_ref()),
             finished_at: time(job.finished_at.as_ref()),

@@ -12,6 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use ign_bake::{BakeJob, Recipe, bake};
 use ign_events::{Event, Failure, FailureKind, JobFile};
+use ign_trace::{Exporter, Span, TraceParent};
 
 use crate::{agent, gpu, output};
 
@@ -36,10 +37,30 @@ pub(crate) fn run(options: &Options) -> ExitCode {
             agent::until_end(&mut std::io::stdin().lock());
             agent::die();
         });
+    let exporter = Exporter::from_env("ign-worker exec").unwrap_or_else(|error| {
+        output::say(&format!("going on without traces: {error}"));
+        None
+    });
+    let stages = exporter
+        .as_ref()
+        .map(|exporter| Mutex::new(Stages::begin(exporter)));
+    let told = |event: Event| {
+        if let (Some(stages), Event::Progress(progress)) = (&stages, &event) {
+            let mut stages = stages.lock().unwrap_or_else(PoisonError::into_inner);
+            stages.enter(&progress.stage);
+        }
+        emit(&event);
+    };
     let result = watcher
         .map_err(|error| crashed(format!("cannot start a thread: {error}"), String::new()))
         .and_then(|_detached| read_job(options))
-        .and_then(|job| guarded(|| bake(&job, &|event| emit(&event)).map_err(|e| e.failure())));
+        .and_then(|job| guarded(|| bake(&job, &told).map_err(|e| e.failure())));
+    if let Some(stages) = stages {
+        let stages = stages.into_inner().unwrap_or_else(PoisonError::into_inner);
+        stages.end(result.as_ref().err());
+    }
+    // Before the last event: when the agent has read that, it waits no longer.
+    drop(exporter);
     match result {
         Ok(bundle) => {
             emit(&Event::Done { bundle });
@@ -48,6 +69,41 @@ pub(crate) fn run(options: &Options) -> ExitCode {
         Err(failure) => {
             emit(&Event::Failed(failure));
             ExitCode::FAILURE
+        }
+    }
+}
+
+/// Spans of the bake and of the stage that it is in, under the agent's.
+struct Stages<'a> {
+    exporter: &'a Exporter,
+    bake: Span,
+    stage: Option<(String, Span)>,
+}
+
+impl<'a> Stages<'a> {
+    fn begin(exporter: &'a Exporter) -> Self {
+        let told = std::env::var(ign_trace::VARIABLE).ok();
+        let parent: Option<TraceParent> = told.and_then(|text| text.parse().ok());
+        Self {
+            exporter,
+            bake: exporter.span("bake", parent.as_ref()),
+            stage: None,
+        }
+    }
+
+    fn enter(&mut self, stage: &str) {
+        if self.stage.as_ref().is_none_or(|(name, _)| name != stage) {
+            // The last one ends before the next begins.
+            self.stage = None;
+            let bake = self.bake.traceparent();
+            let span = self.exporter.span(stage.to_owned(), bake.as_ref());
+            self.stage = Some((stage.to_owned(), span));
+        }
+    }
+
+    fn end(mut self, failure: Option<&Failure>) {
+        if let Some(failure) = failure {
+            self.bake.failed(failure.message.clone());
         }
     }
 }

@@ -14,6 +14,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
+use serde_json::json;
 use tch::{Kind, Tensor};
 
 use crate::output;
@@ -76,7 +77,10 @@ pub(crate) fn enable() -> Result<()> {
 
 /// In the probe's process: computes something on the device and names it.
 pub(crate) fn check() -> Result<String> {
-    let device = ign_nets::select_device();
+    check_on(ign_nets::select_device())
+}
+
+fn check_on(device: tch::Device) -> Result<String> {
     let sum = Tensor::f_ones([64, 64], (Kind::Float, device))
         .and_then(|ones| ones.f_matmul(&ones))
         .and_then(|product| product.f_sum(Kind::Float))
@@ -87,6 +91,59 @@ pub(crate) fn check() -> Result<String> {
         "the device computes wrongly: {sum}"
     );
     Ok(ign_nets::device::name(device))
+}
+
+/// What bakes run on, for people: a list of `{name, state, detail, hint}`.
+pub(crate) fn report() -> serde_json::Value {
+    let check = |name, state, detail: String, hint| json!({"name": name, "state": state, "detail": detail, "hint": hint});
+    let torch = match check_on(tch::Device::Cpu) {
+        Ok(device) => check("torch", "ok", format!("computes on the {device}"), None),
+        Err(error) => check(
+            "torch",
+            "failed",
+            format!("{error:#}"),
+            Some("run `make setup`"),
+        ),
+    };
+    let unused = |detail: &str| ("ok", format!("{detail}; bakes run on the CPU"), None);
+    let (state, detail, hint) = if !Path::new("/dev/nvidiactl").exists() {
+        unused("no NVIDIA device here")
+    } else if std::env::var_os("IGN_DEVICE").is_some_and(|device| device == "cpu") {
+        unused("IGN_DEVICE=cpu")
+    } else {
+        let model = model().unwrap_or_else(|| "an NVIDIA device".to_owned());
+        match cuda_library() {
+            None => (
+                "warn",
+                format!("{model} is there, but no libtorch_cuda.so; bakes run on the CPU"),
+                Some(
+                    "put the full wheel's libraries beside libtorch_cpu.so, or name it by IGN_LIBTORCH_CUDA",
+                ),
+            ),
+            Some(library) => {
+                let envs = [
+                    (OsString::from(SETTLED), OsString::from("1")),
+                    ("LD_PRELOAD".into(), library.into()),
+                ];
+                match probe_with(&envs) {
+                    Ok(device) if device.starts_with("cuda") => {
+                        ("ok", format!("{model} computes ({device})"), None)
+                    }
+                    Ok(device) => (
+                        "warn",
+                        format!("{model} is there, but torch takes the {device}"),
+                        Some("look at the driver: nvidia-smi"),
+                    ),
+                    Err(error) => (
+                        "warn",
+                        format!("{model} cannot be used, bakes run on the CPU: {error:#}"),
+                        Some("look at the driver: nvidia-smi"),
+                    ),
+                }
+            }
+        }
+    };
+    json!([torch, check("gpu", state, detail, hint)])
 }
 
 fn probe_with(envs: &[(OsString, OsString)]) -> Result<String> {
@@ -158,6 +215,14 @@ fn model() -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_report_says_what_bakes_run_on() {
+        let report = report();
+        assert_eq!(report[0]["name"], "torch");
+        assert_eq!(report[0]["state"], "ok", "{report}");
+        assert_eq!(report[1]["name"], "gpu");
+    }
 
     #[test]
     fn the_chosen_device_computes() {

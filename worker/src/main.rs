@@ -46,6 +46,9 @@ enum Command {
     /// Print what bakes run on; fails when that does not work.
     #[command(hide = true)]
     Device,
+    /// Print what bakes need of this machine, as JSON, for ignctl doctor.
+    #[command(hide = true)]
+    Doctor,
 }
 
 fn main() -> ExitCode {
@@ -61,6 +64,10 @@ fn main() -> ExitCode {
             Ok(())
         }
         Command::Device => gpu::check().map(|device| output::data(&device)),
+        Command::Doctor => {
+            output::data(&gpu::report().to_string());
+            Ok(())
+        }
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

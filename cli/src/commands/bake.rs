@@ -166,6 +166,8 @@ async fn connect(context: &Context) -> Result<(Connection, Option<Embedded>), Pr
             threads: None,
             listen: std::net::SocketAddr::from(([127, 0, 0, 1], 0)),
             behind_tls_proxy: false,
+            care: ign_coordinator::Care::default(),
+            webhook_internal: Vec::new(),
             own: true,
         };
         match Embedded::start(&options).await {

@@ -5,8 +5,9 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use chrono::Utc;
-use ign_proto::v1;
-use serde::Serialize;
+use ign_proto::{Cause, v1};
+use serde::{Deserialize, Serialize};
+use tonic::Code;
 
 use crate::Context;
 use crate::connection::{Connection, EndpointFile};
@@ -17,6 +18,10 @@ use crate::views::time;
 
 /// Less free space than this is worth a warning: one bake's work folder and bundle.
 const FREE_BYTES: u64 = 2_000_000_000;
+/// For the worker to start.
+const WORKER_LIMIT: Duration = Duration::from_secs(30);
+/// For torch to compute something; loading the GPU's library for the first time reads gigabytes.
+const GPU_LIMIT: Duration = Duration::from_mins(4);
 /// Clocks that differ by more confuse people who read times, though not leases.
 const SKEW_SECS: f64 = 5.0;
 
@@ -25,20 +30,20 @@ const SKEW_SECS: f64 = 5.0;
 pub(crate) struct Args {}
 
 /// One thing that was looked at.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Deserialize, Serialize)]
 struct Check {
-    name: &'static str,
+    name: String,
     /// `ok`, `warn` or `failed`.
-    state: &'static str,
+    state: String,
     detail: String,
     hint: Option<String>,
 }
 
 impl Check {
-    fn new(name: &'static str, state: &'static str, detail: impl Into<String>) -> Self {
+    fn new(name: &str, state: &str, detail: impl Into<String>) -> Self {
         Self {
-            name,
-            state,
+            name: name.to_owned(),
+            state: state.to_owned(),
             detail: detail.into(),
             hint: None,
         }
@@ -49,7 +54,7 @@ impl Check {
         self
     }
 
-    fn problem(name: &'static str, state: &'static str, problem: &Problem) -> Self {
+    fn problem(name: &str, state: &str, problem: &Problem) -> Self {
         let at = if problem.at.is_empty() {
             String::new()
         } else {
@@ -74,7 +79,7 @@ pub(crate) async fn run(context: &Context, _args: &Args) -> Result<(), Problem> 
                 "ok",
                 connection.target.url.to_string(),
             ));
-            checks.push(store(&connection).await);
+            checks.extend(diagnosis(&connection).await);
             checks.extend(coordinator(&connection).await);
         }
         // Without a service, `bake` starts its own: only a server that was named must answer.
@@ -95,7 +100,7 @@ pub(crate) async fn run(context: &Context, _args: &Args) -> Result<(), Problem> 
         let data = context.connection.data_dir()?;
         checks.push(writable(&data));
         checks.push(space(&data));
-        checks.push(worker().await);
+        checks.extend(worker().await);
     }
     output::data(context.format, &checks, || table(&checks))?;
     let failed = checks
@@ -120,6 +125,29 @@ fn named_but_silent(context: &Context) -> bool {
         .connection
         .data_dir()
         .is_ok_and(|data| EndpointFile::of_live_service(&data).is_some())
+}
+
+/// What the coordinator says of what it stands on, where the token may hear it.
+async fn diagnosis(connection: &Connection) -> Vec<Check> {
+    match connection.admin().diagnose(v1::DiagnoseRequest {}).await {
+        Ok(answer) => answer
+            .into_inner()
+            .checks
+            .into_iter()
+            .map(|check| Check {
+                name: check.name,
+                state: check.state,
+                detail: check.detail,
+                hint: (!check.hint.is_empty()).then_some(check.hint),
+            })
+            .collect(),
+        Err(status) => match Cause::from_status(&status) {
+            // For operators alone; others hear whether it is ready.
+            Cause::Forbidden { .. } => vec![store(connection).await],
+            _ if status.code() == Code::Unimplemented => vec![store(connection).await],
+            _ => vec![Check::problem("database", "failed", &Problem::from(status))],
+        },
+    }
 }
 
 async fn store(connection: &Connection) -> Check {
@@ -231,37 +259,57 @@ fn space(data: &Path) -> Check {
     }
 }
 
-async fn worker() -> Check {
+/// The worker beside this program, and what it says of torch and GPU.
+async fn worker() -> Vec<Check> {
     let program = match find_worker() {
         Ok(program) => program,
-        Err(problem) => return Check::problem("worker", "failed", &problem),
+        Err(problem) => return vec![Check::problem("worker", "failed", &problem)],
     };
     let at = program.display().to_string();
-    let hint = "run `make setup`; it fetches libtorch, which the worker needs";
-    let run = tokio::process::Command::new(&program)
-        .arg("--version")
+    let failed = |why: String| {
+        vec![
+            Check::new("worker", "failed", format!("{at}: {why}"))
+                .hint("run `make setup`; it fetches libtorch, which the worker needs"),
+        ]
+    };
+    let version = match ask_worker(&program, "--version", WORKER_LIMIT).await {
+        Ok(version) => version,
+        Err(why) => return failed(why),
+    };
+    let state = if version.ends_with(env!("CARGO_PKG_VERSION")) {
+        "ok"
+    } else {
+        "warn"
+    };
+    let mut checks = vec![Check::new("worker", state, format!("{version} ({at})"))];
+    match ask_worker(&program, "doctor", GPU_LIMIT).await {
+        Ok(said) => match serde_json::from_str::<Vec<Check>>(&said) {
+            Ok(more) => checks.extend(more),
+            Err(error) => checks.push(Check::new("torch", "warn", format!("{at}: {error}"))),
+        },
+        Err(why) => checks.push(Check::new("torch", "failed", format!("{at}: {why}"))),
+    }
+    checks
+}
+
+/// What the worker prints; why it does not, otherwise.
+async fn ask_worker(program: &Path, argument: &str, limit: Duration) -> Result<String, String> {
+    let run = tokio::process::Command::new(program)
+        .arg(argument)
         .stdin(Stdio::null())
         .kill_on_drop(true)
         .output();
-    match tokio::time::timeout(Duration::from_secs(30), run).await {
+    match tokio::time::timeout(limit, run).await {
         Ok(Ok(out)) if out.status.success() => {
-            let version = String::from_utf8_lossy(&out.stdout).trim().to_string();
-            let own = env!("CARGO_PKG_VERSION");
-            let state = if version.ends_with(own) { "ok" } else { "warn" };
-            Check::new("worker", state, format!("{version} ({at})"))
+            Ok(String::from_utf8_lossy(&out.stdout).trim().to_owned())
         }
         Ok(Ok(out)) => {
             let said = String::from_utf8_lossy(&out.stderr);
-            let said = said.lines().last().unwrap_or("it says nothing").to_string();
-            Check::new("worker", "failed", format!("{at}: {}: {said}", out.status)).hint(hint)
+            let said = said.lines().last().unwrap_or("it says nothing").to_owned();
+            Err(format!("{}: {said}", out.status))
         }
-        Ok(Err(error)) => Check::new("worker", "failed", format!("{at}: {error}")).hint(hint),
-        Err(_) => Check::new(
-            "worker",
-            "failed",
-            format!("{at} does not answer within 30 s"),
-        )
-        .hint(hint),
+        Ok(Err(error)) => Err(error.to_string()),
+        Err(_) => Err(format!("no answer within {} s", limit.as_secs())),
     }
 }
 
@@ -269,8 +317,8 @@ fn table(checks: &[Check]) -> String {
     let mut table = Table::new(&["CHECK", "STATE", "DETAIL"]);
     for check in checks {
         table.row([
-            check.name.to_string(),
-            check.state.to_string(),
+            check.name.clone(),
+            check.state.clone(),
             check.detail.clone(),
         ]);
     }

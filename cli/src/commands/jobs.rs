@@ -9,6 +9,7 @@ use chrono::{DateTime, Utc};
 use futures::StreamExt as _;
 use futures::stream::FuturesUnordered;
 use ign_proto::{Cause, CollectionId, ObjectName, v1};
+use ign_trace::TraceParent;
 use serde::Serialize;
 
 use crate::Context;
@@ -287,6 +288,7 @@ fn details(job: &JobView, now: DateTime<Utc>) -> String {
             "checkpoint",
             job.checkpoint_digest.clone().unwrap_or_default(),
         ),
+        ("trace", job.trace_id.clone().unwrap_or_default()),
     ])
 }
 
@@ -436,6 +438,9 @@ struct LogView {
 pub(crate) async fn logs(context: &Context, args: &LogsArgs) -> Result<(), Problem> {
     let connection = Connection::open(&context.connection).await?;
     let job = find(&connection, &args.job).await?;
+    if let Ok(trace) = job.traceparent.parse::<TraceParent>() {
+        output::note(&format!("trace {}", trace.trace_id()));
+    }
     let mut after_seq = 0;
     let mut breaks = 0;
     loop {

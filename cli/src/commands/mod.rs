@@ -14,3 +14,5 @@ pub(crate) mod status;
 pub(crate) mod submit;
 pub(crate) mod token;
 pub(crate) mod up;
+pub(crate) mod webhook;
+pub(crate) mod worker;

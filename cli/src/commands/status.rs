@@ -190,7 +190,8 @@ fn running(jobs: &[JobView], ids: &ShortIds) -> Option<Table> {
     (!jobs.is_empty()).then_some(table)
 }
 
-fn workers(workers: &[WorkerView], ids: &ShortIds, now: DateTime<Utc>) -> Option<Table> {
+/// One row for each worker; none for none.
+pub(crate) fn workers(workers: &[WorkerView], ids: &ShortIds, now: DateTime<Utc>) -> Option<Table> {
     let mut table = Table::new(&["WORKER", "HOST", ">SEEN", "JOB", "VERSION", "DEVICE"]);
     for worker in workers {
         let doing = match (&worker.job_id, worker.draining) {

@@ -1,6 +1,10 @@
 //! `up`: the whole service on this machine, in the foreground.
 
 use std::net::SocketAddr;
+use std::time::Duration;
+
+use ign_coordinator::Care;
+use ign_registry::StoreConfig;
 
 use crate::Context;
 use crate::embedded::{Embedded, Options, interrupted};
@@ -22,6 +26,18 @@ pub(crate) struct Args {
     /// Listen beyond this machine without TLS, because a proxy in front speaks it
     #[arg(long)]
     behind_tls_proxy: bool,
+    /// Refuse new work while the data folder's disk has less free space than this; 0 never refuses
+    #[arg(long, value_name = "MIB", default_value_t = 512)]
+    reserve_mib: u64,
+    /// Read every digest of the store again once in this many days; 0 only on request (ignctl admin audit)
+    #[arg(long, value_name = "DAYS", default_value_t = 30)]
+    audit_days: u32,
+    /// Folder or bucket with the same content, from which damaged files are repaired; it is only read
+    #[arg(long, value_name = "URL")]
+    replica: Option<String>,
+    /// Receiver of webhooks in your own network, which may have a private address and speak plain http; may be repeated
+    #[arg(long, value_name = "HOST:PORT")]
+    webhook_internal: Vec<String>,
 }
 
 fn workers(text: &str) -> Result<usize, String> {
@@ -45,6 +61,12 @@ pub(crate) async fn run(context: &Context, args: &Args) -> Result<(), Problem> {
         threads: args.threads,
         listen: args.listen,
         behind_tls_proxy: args.behind_tls_proxy,
+        care: Care {
+            reserve_bytes: args.reserve_mib.saturating_mul(1024 * 1024),
+            audit_every: (args.audit_days > 0).then(|| Duration::from_hours(24) * args.audit_days),
+            replica: args.replica.clone().map(StoreConfig::new),
+        },
+        webhook_internal: args.webhook_internal.clone(),
         own: false,
     };
     let mut service = Embedded::start(&options).await?;

@@ -32,7 +32,9 @@ fn help_and_usage_errors() {
     let help = run(&["--help"], &[]);
     assert_eq!(help.status.code(), Some(0));
     insta::assert_snapshot!(stdout(&help));
-    for command in ["up", "bake", "submit", "status", "wait", "bundle", "admin"] {
+    for command in [
+        "up", "bake", "submit", "status", "wait", "webhook", "worker", "bundle", "admin",
+    ] {
         let help = run(&[command, "--help"], &[]);
         assert_eq!(help.status.code(), Some(0), "{command}");
         insta::assert_snapshot!(format!("help_{command}"), stdout(&help));
@@ -445,13 +447,20 @@ fn a_second_service_on_the_same_folder_is_refused() {
     for name in [
         "server",
         "token",
+        "database",
+        "database clock",
         "store",
+        "server disk",
         "version",
         "clock",
         "data folder",
     ] {
         assert_eq!(state(name), "ok", "{name}: {checks}");
     }
+    let store = checks.as_array().unwrap();
+    let store = store.iter().find(|check| check["name"] == "store").unwrap();
+    let detail = store["detail"].as_str().unwrap();
+    assert!(detail.contains("honours conditional put"), "{detail}");
 }
 
 #[test]
@@ -646,4 +655,37 @@ fn an_operator_cares_for_the_registry() {
         .map(|event| event["kind"].as_str().unwrap())
         .collect();
     assert_eq!(kinds, ["audit", "rebuild", "collect"]);
+}
+
+#[test]
+fn workers_are_drained_and_come_back() {
+    let service = Service::start();
+    let parent = tempfile::tempdir().unwrap();
+    let folder = capture(parent.path(), "vase");
+    let submitted = service.run(&[
+        "submit",
+        folder.to_str().unwrap(),
+        "--object",
+        "museum/vase",
+    ]);
+    assert_eq!(submitted.status.code(), Some(0), "{}", stderr(&submitted));
+    let worker = FakeWorker::new(&service);
+    worker.run_one(async |worker, lease| worker.publish(&lease).await);
+
+    let draining = |args: &[&str]| {
+        let workers = json(&service.run(&[&["worker"], args, &["-o", "json"]].concat()));
+        assert_eq!(workers.as_array().unwrap().len(), 1);
+        assert_eq!(workers[0]["id"], worker::NAME);
+        workers[0]["draining"].as_bool().unwrap()
+    };
+    assert!(!draining(&["list"]));
+    assert!(draining(&["drain", worker::NAME]));
+    assert!(draining(&["list"]));
+    let shown = service.run(&["status"]);
+    assert!(stdout(&shown).contains("draining"), "{}", stdout(&shown));
+    assert!(!draining(&["undrain", "--all"]));
+    let nobody = service.run(&["worker", "drain", "nobody"]);
+    assert_eq!(nobody.status.code(), Some(1));
+    assert!(stderr(&nobody).contains("nobody"), "{}", stderr(&nobody));
+    assert_eq!(service.run(&["worker", "drain"]).status.code(), Some(2));
 }

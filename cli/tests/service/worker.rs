@@ -15,7 +15,7 @@ use tonic::transport::Channel;
 
 use crate::harness::Service;
 
-const NAME: &str = "fake-1";
+pub(crate) const NAME: &str = "fake-1";
 
 /// Address and token of the service it works for.
 #[derive(Clone)]

@@ -69,6 +69,11 @@ pub(crate) const TABLE: &[(&str, &str, Need)] = &[
     ("POST", "/ign.v1.Bundles/Restore", ADMIN),
     ("POST", "/ign.v1.Collections/List", READ),
     ("POST", "/ign.v1.Collections/Set", ADMIN),
+    ("POST", "/ign.v1.Collections/SetWebhook", ADMIN),
+    ("POST", "/ign.v1.Collections/RemoveWebhook", ADMIN),
+    ("POST", "/ign.v1.Collections/ListWebhooks", ADMIN),
+    ("POST", "/ign.v1.Collections/ListDeliveries", ADMIN),
+    ("POST", "/ign.v1.Collections/Redeliver", ADMIN),
     (
         "POST",
         "/ign.v1.Tokens/Create",
@@ -107,6 +112,16 @@ pub(crate) const TABLE: &[(&str, &str, Need)] = &[
     (
         "POST",
         "/ign.v1.Admin/ListEvents",
+        Need::Everywhere(Scope::Admin),
+    ),
+    (
+        "POST",
+        "/ign.v1.Admin/DrainWorkers",
+        Need::Everywhere(Scope::Admin),
+    ),
+    (
+        "POST",
+        "/ign.v1.Admin/Diagnose",
         Need::Everywhere(Scope::Admin),
     ),
     ("GET HEAD", "/v2/", Need::AnyToken),

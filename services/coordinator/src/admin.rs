@@ -1,16 +1,17 @@
-//! `ign.v1.Admin`: what an operator does to the registry as a whole.
+//! `ign.v1.Admin`: what an operator does to the registry as a whole, and to workers.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ign_proto::v1::admin_server::Admin;
-use ign_proto::{Cause, v1};
+use ign_proto::{Cause, WorkerId, v1};
 use ign_registry::Tally;
 use tonic::{Request, Response, Status};
 
 use crate::app::App;
 use crate::care::outcome_word;
-use crate::convert::to_timestamp;
+use crate::convert::{parsed, to_timestamp, to_worker};
 use crate::http_answer::Refused;
 use crate::trace;
 
@@ -124,5 +125,41 @@ impl Admin for AdminApi {
                 })
                 .collect(),
         }))
+    }
+
+    async fn drain_workers(
+        &self,
+        request: Request<v1::DrainWorkersRequest>,
+    ) -> Answer<v1::DrainWorkersResponse> {
+        let request = request.into_inner();
+        let mut ids: BTreeSet<WorkerId> = BTreeSet::new();
+        for id in &request.worker_ids {
+            ids.insert(parsed(id, "worker_ids")?);
+        }
+        let store = &self.0.store;
+        if ids.is_empty() {
+            let workers = store.workers().await.map_err(Refused::from)?;
+            ids.extend(workers.into_iter().map(|worker| worker.info.id));
+        }
+        for id in &ids {
+            store
+                .drain_worker(id, request.draining)
+                .await
+                .map_err(Refused::from)?;
+            tracing::info!(worker.id = %id, draining = request.draining, "drain set");
+        }
+        let mut workers = store.workers().await.map_err(Refused::from)?;
+        workers.retain(|worker| ids.contains(&worker.info.id));
+        Ok(Response::new(v1::DrainWorkersResponse {
+            workers: workers.iter().map(to_worker).collect(),
+        }))
+    }
+
+    async fn diagnose(
+        &self,
+        _request: Request<v1::DiagnoseRequest>,
+    ) -> Answer<v1::DiagnoseResponse> {
+        let checks = self.0.diagnose().await;
+        Ok(Response::new(v1::DiagnoseResponse { checks }))
     }
 }

@@ -9,10 +9,12 @@ use tokio_util::sync::CancellationToken;
 
 use crate::auth::Doorkeeper;
 use crate::fetch::Contents;
+use crate::holders::Holders;
 use crate::limits::Limits;
 use crate::metrics::Metrics;
 use crate::publish::Mirror;
 use crate::room::Room;
+use crate::webhooks::Receivers;
 
 /// The coordinator's parts; one for all connections.
 pub(crate) struct App {
@@ -20,11 +22,14 @@ pub(crate) struct App {
     pub(crate) registry: Registry,
     pub(crate) doorkeeper: Doorkeeper,
     pub(crate) contents: Contents,
+    pub(crate) holders: Holders,
     pub(crate) limits: Limits,
     pub(crate) metrics: Metrics,
     pub(crate) mirror: Mirror,
     pub(crate) redirect_blobs: bool,
     pub(crate) room: Room,
+    /// Who may be sent webhooks.
+    pub(crate) receivers: Receivers,
     /// Where damaged content is repaired from.
     pub(crate) replica: Option<Registry>,
     /// How often every digest is read again.

@@ -167,7 +167,8 @@ impl App {
         let Some(text) = bearer(headers) else {
             return match peer.and_then(|peer| peer.certificate.as_deref()) {
                 Some(name) if !headers.contains_key(AUTHORIZATION) => Ok(Arc::new(Caller::new(
-                    name,
+                    // No token's id looks like this.
+                    format!("certificate {name}"),
                     vec![Grant::everywhere(Scope::Publish)],
                 ))),
                 _ => Err(Cause::Unauthenticated.into()),

@@ -28,7 +28,7 @@ impl BundlesApi {
 
 impl App {
     /// Fails unless all files of a version are there.
-    async fn check_files(&self, version: &Version) -> Result<(), Refused> {
+    pub(crate) async fn check_files(&self, version: &Version) -> Result<(), Refused> {
         let gone = || {
             Refused(Cause::NotAllowed {
                 reason: "FILES_COLLECTED".to_owned(),

@@ -36,6 +36,8 @@ pub struct Config {
     pub limits: Limits,
     /// What keeps the store sound.
     pub care: Care,
+    /// Receivers of webhooks, `host:port`, that may be private and plain HTTP; all others take HTTPS and a public address.
+    pub webhook_internal: Vec<String>,
 }
 
 /// What keeps the store sound over the years.
@@ -115,6 +117,13 @@ pub enum ServeError {
     Rebuild {
         /// What went wrong; the log has the story.
         reason: String,
+    },
+    /// No HTTP client for webhooks.
+    #[error("cannot prepare to send webhooks")]
+    Webhooks {
+        /// What is wrong.
+        #[source]
+        source: reqwest::Error,
     },
     /// The endpoint file cannot be written.
     #[error("cannot write {}", path.display())]

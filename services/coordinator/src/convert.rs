@@ -3,8 +3,8 @@
 use chrono::{DateTime, Utc};
 use ign_proto::{Attempt, Cause, Digest, JobId, ObjectName, v1};
 use ign_queue::{
-    Collection, Failure, FailureKind, Job, JobSpec, JobState, Level, LogLine, NewLogLine, Progress,
-    Version, Worker, WorkerInfo,
+    Collection, Delivery, DeliveryState, Failure, FailureKind, Job, JobSpec, JobState, Level,
+    LogLine, NewLogLine, Progress, Version, Webhook, Worker, WorkerInfo,
 };
 use prost_types::Timestamp;
 
@@ -197,6 +197,7 @@ pub(crate) fn to_job(job: &Job) -> v1::Job {
         queue_position: 0,
         waiting_for: String::new(),
         max_attempts: job.attempt_limit,
+        traceparent: job.traceparent.clone().unwrap_or_default(),
     }
 }
 
@@ -279,5 +280,29 @@ pub(crate) fn to_collection(collection: &Collection) -> v1::Collection {
         weight: collection.weight,
         max_running: collection.max_running,
         paused: collection.paused,
+    }
+}
+
+pub(crate) fn to_webhook(webhook: &Webhook) -> v1::Webhook {
+    v1::Webhook {
+        collection: webhook.collection.to_string(),
+        url: webhook.url.clone(),
+        set_at: Some(to_timestamp(webhook.set_at)),
+    }
+}
+
+pub(crate) fn to_delivery(delivery: &Delivery) -> v1::Delivery {
+    let pending = delivery.state == DeliveryState::Pending;
+    v1::Delivery {
+        id: delivery.id.clone(),
+        collection: delivery.collection.to_string(),
+        job_id: delivery.job.to_string(),
+        event: delivery.event.clone(),
+        state: delivery.state.as_str().to_owned(),
+        tries: delivery.tries,
+        created_at: Some(to_timestamp(delivery.created_at)),
+        next_at: pending.then(|| to_timestamp(delivery.next_at)),
+        ended_at: delivery.ended_at.map(to_timestamp),
+        last_error: delivery.last_error.clone().unwrap_or_default(),
     }
 }

@@ -191,6 +191,7 @@ impl App {
                 Ok(Submit {
                     request_id: request.request_id,
                     spec,
+                    traceparent: ign_trace::current().map(|trace| trace.to_string()),
                 })
             })
             .collect();

@@ -6,6 +6,7 @@
 //!                          +-> /v2/... blobs and manifests (data_plane)     -> ign-registry (bucket)
 //!                          +-> /healthz /readyz /metrics, gRPC health and reflection
 //!   tasks: reap lost leases · mirror what is published into the bucket · drop stale uploads · audit
+//!          send webhooks
 //! ```
 //!
 //! **Architecture invariants.** The coordinator decides nothing by itself: every rule about jobs is the queue's, under a
@@ -26,10 +27,12 @@ mod config;
 mod connections;
 mod convert;
 mod data_plane;
+mod diagnose;
 mod error;
 mod fetch;
 #[doc(hidden)]
 pub mod fuzz;
+mod holders;
 mod http_answer;
 mod jobs;
 mod limits;
@@ -44,6 +47,7 @@ mod tls;
 mod token;
 mod tokens;
 mod trace;
+mod webhooks;
 mod workers;
 
 pub use config::{Care, Config, ServeError};

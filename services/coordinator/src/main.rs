@@ -9,8 +9,11 @@ use clap::{Parser, ValueEnum};
 use ign_coordinator::{Care, Config, Limits, TlsFiles, serve};
 use ign_queue::Settings;
 use ign_registry::StoreConfig;
+use ign_trace::Exporter;
 use tokio::signal::unix::{SignalKind, signal};
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{EnvFilter, Layer as _};
 
 /// Serves jobs, workers, captures and bundles on one port.
 ///
@@ -65,6 +68,15 @@ struct Args {
     /// Store with the same content from which damaged files are repaired; it is only read.
     #[arg(long, env = "IGN_REPLICA")]
     replica: Option<String>,
+    /// Receiver of webhooks in your own network, HOST:PORT; those named here may have private addresses and speak plain
+    /// http, all others take https and a public address. May be given more than once.
+    #[arg(
+        long,
+        env = "IGN_WEBHOOK_INTERNAL",
+        value_name = "HOST:PORT",
+        value_delimiter = ','
+    )]
+    webhook_internal: Vec<String>,
     /// Form of the log on stderr; IGN_LOG sets the level (info, debug, ign_coordinator=debug, ...).
     #[arg(long, env = "IGN_LOG_FORMAT", value_enum, default_value = "text")]
     log_format: LogFormat,
@@ -90,14 +102,27 @@ fn lease_secs(text: &str) -> Result<f64, String> {
 fn main() -> ExitCode {
     let args = Args::parse();
     let filter = EnvFilter::try_from_env("IGN_LOG").unwrap_or_else(|_unset| EnvFilter::new("info"));
-    let log = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr);
-    match args.log_format {
-        LogFormat::Text => log.with_ansi(false).init(),
-        LogFormat::Json => log.json().init(),
-    }
-    match run(args) {
+    let log = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    let log = match args.log_format {
+        LogFormat::Text => log.with_ansi(false).boxed(),
+        LogFormat::Json => log.json().boxed(),
+    };
+    let exporter = Exporter::from_env("ign-coordinator");
+    tracing_subscriber::registry()
+        .with(log.with_filter(filter))
+        .with(
+            exporter
+                .as_ref()
+                .ok()
+                .and_then(Option::as_ref)
+                .map(Exporter::layer),
+        )
+        .init();
+    // It ends last, so that it sends the last spans.
+    let outcome = exporter
+        .map_err(anyhow::Error::from)
+        .and_then(|_exporter| run(args));
+    match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             tracing::error!("{error:#}");
@@ -135,6 +160,7 @@ async fn run(args: Args) -> anyhow::Result<()> {
             audit_every: (args.audit_days > 0).then(|| Duration::from_hours(24) * args.audit_days),
             replica: args.replica.map(StoreConfig::new),
         },
+        webhook_internal: args.webhook_internal,
     };
     let shutdown = async move {
         tokio::select! {

@@ -1,5 +1,5 @@
 //! What must happen without anybody asking: taking jobs back from silent workers, repairing the bucket's record of
-//! versions, dropping uploads that nobody goes on with, reading every digest again.
+//! versions, dropping uploads that nobody goes on with, reading every digest again, sending webhooks.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -8,6 +8,7 @@ use tokio::time::{Instant, MissedTickBehavior};
 
 use crate::app::App;
 use crate::http_answer::Refused;
+use crate::webhooks;
 
 const UPLOAD_SWEEP: Duration = Duration::from_hours(1);
 const AUDIT_TICK: Duration = Duration::from_mins(1);
@@ -17,7 +18,9 @@ const UPLOAD_IDLE: Duration = Duration::from_hours(7 * 24);
 pub(crate) async fn run(app: &App) {
     tokio::select! {
         () = app.stopping.cancelled() => {}
-        ((), (), ()) = async { tokio::join!(reap(app), repair(app), audit(app)) } => {}
+        ((), (), (), ()) = async {
+            tokio::join!(reap(app), repair(app), audit(app), webhooks::run(app))
+        } => {}
     }
 }
 

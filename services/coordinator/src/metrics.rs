@@ -15,6 +15,8 @@ pub(crate) struct Metrics {
     pub(crate) published: AtomicU64,
     pub(crate) reaped: AtomicU64,
     pub(crate) registry_faults: AtomicU64,
+    pub(crate) webhooks_delivered: AtomicU64,
+    pub(crate) webhooks_failed: AtomicU64,
 }
 
 #[derive(Debug, Default)]
@@ -113,6 +115,21 @@ impl Metrics {
             "counter",
             "damaged or absent content that audits found",
             &plain(load(&self.registry_faults)),
+        );
+        metric(
+            "ign_webhook_tries_total",
+            "counter",
+            "webhooks sent, by whether the receiver took them",
+            &[
+                (
+                    "{outcome=\"delivered\"}".to_owned(),
+                    load(&self.webhooks_delivered),
+                ),
+                (
+                    "{outcome=\"failed\"}".to_owned(),
+                    load(&self.webhooks_failed),
+                ),
+            ],
         );
         if let Some(bytes) = resident_bytes() {
             metric(

@@ -4,7 +4,7 @@
 //! no blob is taken either, so that the database can always write: cancelling, retiring and collecting garbage work on.
 //! A bucket does not say how much room it has; its refusals come as [`ign_registry::RegistryError::Full`].
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use ign_proto::Cause;
 
@@ -43,18 +43,25 @@ impl Room {
         }
     }
 
+    /// The folders that are watched, with the free bytes of their disks where these say.
+    pub(crate) fn free(&self) -> impl Iterator<Item = (&Path, u64)> {
+        self.folders.iter().filter_map(|folder| {
+            // A disk that does not say is not held against the work.
+            let stat = rustix::fs::statvfs(folder).ok()?;
+            Some((
+                folder.as_path(),
+                stat.f_bavail.saturating_mul(stat.f_frsize),
+            ))
+        })
+    }
+
     /// Fails while there is too little room for a write.
     pub(crate) fn check(&self, write: Write) -> Result<(), Refused> {
         let (need, reserve) = match write {
             Write::Work => (0, self.reserve_bytes),
             Write::Blob { bytes } => (bytes, self.reserve_bytes / 2),
         };
-        for folder in &self.folders {
-            // A disk that does not say is not held against the work.
-            let Ok(stat) = rustix::fs::statvfs(folder) else {
-                continue;
-            };
-            let free = stat.f_bavail.saturating_mul(stat.f_frsize);
+        for (folder, free) in self.free() {
             if free.saturating_sub(need) < reserve {
                 return Err(Cause::Full {
                     message: format!(

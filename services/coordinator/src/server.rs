@@ -39,6 +39,7 @@ use crate::config::{Config, ServeError};
 use crate::connections::Door;
 use crate::data_plane;
 use crate::fetch::Contents;
+use crate::holders::Holders;
 use crate::http_answer::{Refused, unknown};
 use crate::jobs::JobsApi;
 use crate::maintenance;
@@ -49,6 +50,7 @@ use crate::room::Room;
 use crate::tls::Tls;
 use crate::tokens::TokensApi;
 use crate::trace;
+use crate::webhooks::Receivers;
 use crate::workers::WorkersApi;
 
 /// A coordinator that listens.
@@ -102,6 +104,7 @@ pub async fn serve(
             address: config.listen,
         });
     }
+    let receivers = Receivers::new(&config.webhook_internal)?;
     let registry = Registry::open(&config.store)
         .await
         .map_err(|source| ServeError::Registry { source })?;
@@ -133,11 +136,13 @@ pub async fn serve(
         registry,
         doorkeeper,
         contents: Contents::default(),
+        holders: Holders::default(),
         limits: config.limits,
         metrics: Metrics::default(),
         mirror: Mirror::default(),
         redirect_blobs: config.redirect_blobs,
         room: Room::new(&config),
+        receivers,
         replica,
         audit_every: config.care.audit_every,
         stopping: CancellationToken::new(),

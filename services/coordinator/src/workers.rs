@@ -5,12 +5,11 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use ign_proto::v1::workers_server::Workers;
-use ign_proto::{Cause, JobId, Kind, Manifest, Scope, v1};
+use ign_proto::{Cause, Kind, Manifest, Scope, v1};
 use ign_queue::Checkpoint;
 use tokio::time::Instant;
 use tonic::{Request, Response, Status};
 
-use crate::access::Caller;
 use crate::app::App;
 use crate::auth::caller;
 use crate::convert::{
@@ -29,18 +28,6 @@ type Answer<T> = Result<Response<T>, Status>;
 pub(crate) struct WorkersApi(pub(crate) Arc<App>);
 
 impl WorkersApi {
-    /// Refuses unless the caller works for the job's collection; a job of another one does not exist for it.
-    async fn check(&self, caller: &Caller, job: JobId) -> Result<(), Refused> {
-        let reach = caller.reach(Scope::Publish);
-        if reach.only().is_some() {
-            let found = self.0.store.get(job).await?;
-            if !reach.contains(&found.spec.object.collection) {
-                return Err(Cause::absent("job", job).into());
-            }
-        }
-        Ok(())
-    }
-
     fn lease_secs(&self) -> f64 {
         self.0.store.settings().lease.as_secs_f64()
     }
@@ -49,7 +36,8 @@ impl WorkersApi {
 #[tonic::async_trait]
 impl Workers for WorkersApi {
     async fn lease(&self, request: Request<v1::LeaseRequest>) -> Answer<v1::LeaseResponse> {
-        let reach = caller(request.extensions())?.reach(Scope::Publish);
+        let caller = caller(request.extensions())?;
+        let reach = caller.reach(Scope::Publish);
         let request = request.into_inner();
         let worker = worker_info(&request)?;
         let wait = Duration::try_from_secs_f64(request.wait_secs)
@@ -63,11 +51,13 @@ impl Workers for WorkersApi {
             // In a task of its own: a client that leaves in the middle must not cut a claim in two.
             let claim = trace::spawn({
                 let (app, worker, reach) = (self.0.clone(), worker.clone(), reach.clone());
+                let caller = caller.clone();
                 async move {
                     if full {
                         return Ok(None);
                     }
-                    app.store.lease_within(&worker, reach.only()).await
+                    let holder = Some(caller.name.as_str());
+                    app.store.lease_within(&worker, holder, reach.only()).await
                 }
             });
             let job = claim
@@ -75,6 +65,7 @@ impl Workers for WorkersApi {
                 .map_err(|error| Refused(crate::error::internal(&error)))?;
             if let Some(job) = job.map_err(Refused::from)? {
                 ign_faults::point("lease.committed");
+                self.0.holders.remember(&job);
                 tracing::info!(job.id = %job.id, job.attempt = job.attempt.0, worker.id = %worker.id, "leased");
                 return Ok(Response::new(v1::LeaseResponse {
                     lease: Some(v1::Lease {
@@ -86,6 +77,7 @@ impl Workers for WorkersApi {
                             .map(|it| it.digest.to_string())
                             .unwrap_or_default(),
                         lease_secs: self.lease_secs(),
+                        traceparent: job.traceparent.unwrap_or_default(),
                     }),
                 }));
             }
@@ -107,7 +99,7 @@ impl Workers for WorkersApi {
         let caller = caller(request.extensions())?;
         let request = request.into_inner();
         let (job, attempt) = job_attempt(request.job.as_ref())?;
-        self.check(&caller, job).await?;
+        self.0.check_holder(&caller, job, attempt).await?;
         let (progress, logs) = (request.progress.map(progress), log_lines(request.logs));
         let orders = self
             .0
@@ -129,7 +121,7 @@ impl Workers for WorkersApi {
         let caller = caller(request.extensions())?;
         let request = request.into_inner();
         let (job, attempt) = job_attempt(request.job.as_ref())?;
-        self.check(&caller, job).await?;
+        self.0.check_holder(&caller, job, attempt).await?;
         let checkpoint = Checkpoint {
             digest: parsed(&request.digest, "digest")?,
             size_bytes: request.size_bytes,
@@ -165,7 +157,7 @@ impl Workers for WorkersApi {
         let caller = caller(request.extensions())?;
         let request = request.into_inner();
         let (job, attempt) = job_attempt(request.job.as_ref())?;
-        self.check(&caller, job).await?;
+        self.0.check_holder(&caller, job, attempt).await?;
         let manifest = Manifest::from_wire(Kind::Bundle, &request.files)
             .map_err(|error| Refused(Cause::bad_field("files", error)))?;
         // Not cut short by a client that leaves: the next call finds the outcome.
@@ -190,7 +182,7 @@ impl Workers for WorkersApi {
         let caller = caller(request.extensions())?;
         let request = request.into_inner();
         let (job, attempt) = job_attempt(request.job.as_ref())?;
-        self.check(&caller, job).await?;
+        self.0.check_holder(&caller, job, attempt).await?;
         let failure = failure(required(request.failure, "failure")?)?;
         tracing::info!(job.id = %job, job.attempt = attempt.0, failure = failure.message, "attempt failed");
         let logs = log_lines(request.logs);

@@ -8,6 +8,7 @@ use crate::store::{
     Submit, WorkerInfo,
 };
 use crate::token::NewToken;
+use crate::webhook::{MAX_URL_BYTES, SECRET_BYTES, Secret};
 
 const MAX_REQUEST_ID_BYTES: usize = 200;
 const MAX_LABELS: usize = 32;
@@ -129,6 +130,17 @@ pub(crate) fn token(new: &NewToken) -> Result<()> {
     }
     if new.grants.is_empty() || new.grants.len() > MAX_GRANTS {
         return invalid("grants", format!("must be 1 to {MAX_GRANTS}"));
+    }
+    Ok(())
+}
+
+pub(crate) fn webhook(url: &str, secret: &Secret) -> Result<()> {
+    if url.is_empty() || url.len() > MAX_URL_BYTES || url.chars().any(char::is_control) {
+        return invalid("url", format!("must be 1 to {MAX_URL_BYTES} bytes"));
+    }
+    if !SECRET_BYTES.contains(&secret.0.len()) {
+        let (least, most) = (SECRET_BYTES.start(), SECRET_BYTES.end());
+        return invalid("secret", format!("must be {least} to {most} bytes"));
     }
     Ok(())
 }

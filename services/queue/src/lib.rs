@@ -4,6 +4,7 @@
 //! - [`store`]: what a queue can do, as a trait with its types and errors.
 //! - [`changes`]: waiting for changes.
 //! - [`token`]: bearer tokens.
+//! - [`webhook`]: where events are sent, and the outbox.
 //! - [`postgres`] and [`sqlite`]: the two databases; `sql` is the text they share.
 //!
 //! Invariant: nothing outside the state machine decides what becomes of a job; the stores only find, lock and keep.
@@ -19,6 +20,7 @@ pub mod state;
 pub mod store;
 pub mod token;
 mod waiting;
+pub mod webhook;
 
 pub use changes::Changes;
 pub use state::{
@@ -30,6 +32,7 @@ pub use store::{
     WorkerInfo,
 };
 pub use token::{NewToken, SecretHash, Token, TokenKey, Tokens};
+pub use webhook::{Delivery, DeliveryState, Dispatch, Secret, Tried, Webhook, Webhooks};
 
 /// Opens the store that the URL names (`sqlite:///path/to/file` or `postgres://...`) and brings its schema up to date.
 pub async fn open(url: &str, settings: Settings) -> store::Result<Arc<dyn Store>> {

@@ -33,6 +33,11 @@ use crate::store::{
 use crate::token::{NewToken, SecretHash, Token, TokenKey, Tokens};
 use crate::waiting::{Rival, Surroundings, describe};
 
+#[path = "webhook_sql.rs"]
+mod webhook_sql;
+
+use webhook_sql::announce;
+
 type DbRow = <Db as sqlx::Database>::Row;
 
 /// Rows of one insert; a row has at most a dozen bound values, and `SQLite` takes 32,766 of them.
@@ -49,7 +54,7 @@ const MAX_LINES_PER_CALL: usize = 2000;
 
 const JOB: &str = "id, collection, object, request_id, capture_digest, recipe_json, priority, labels, max_attempts, \
     state, attempt, attempt_limit, worker, cancel_requested, progress, failure, checkpoint_digest, checkpoint_bytes, \
-    version, submitted_at, not_before, started_at, finished_at, lease_until";
+    version, submitted_at, not_before, started_at, finished_at, lease_until, holder, holder_attempt, traceparent";
 
 /// The queue in a database.
 #[derive(Debug)]
@@ -116,6 +121,12 @@ fn job_from(row: &DbRow) -> Result<Job> {
         }),
         None => None,
     };
+    let attempt = Attempt(small(row.try_get("attempt")?)?);
+    // An older coordinator leases without a holder and leaves that of an earlier attempt there.
+    let holder = match row.try_get::<Option<i64>, _>("holder_attempt")? {
+        Some(of) if of == i64::from(attempt.0) => row.try_get("holder")?,
+        _ => None,
+    };
     Ok(Job {
         id: from_key(row.try_get("id")?)?,
         request_id: row.try_get("request_id")?,
@@ -128,12 +139,13 @@ fn job_from(row: &DbRow) -> Result<Job> {
             max_attempts: small(row.try_get("max_attempts")?)?,
         },
         state: parse(row.try_get("state")?)?,
-        attempt: Attempt(small(row.try_get("attempt")?)?),
+        attempt,
         attempt_limit: small(row.try_get("attempt_limit")?)?,
         worker: row
             .try_get::<Option<&str>, _>("worker")?
             .map(parse)
             .transpose()?,
+        holder,
         cancel_requested: row.try_get("cancel_requested")?,
         progress: row
             .try_get::<Option<Json<Progress>>, _>("progress")?
@@ -151,6 +163,7 @@ fn job_from(row: &DbRow) -> Result<Job> {
         started_at: optional_time(row, "started_at")?,
         finished_at: optional_time(row, "finished_at")?,
         lease_until: optional_time(row, "lease_until")?,
+        traceparent: row.try_get("traceparent")?,
     })
 }
 
@@ -206,7 +219,8 @@ async fn save_job(connection: &mut Connection, job: &Job) -> Result<()> {
     sqlx::query(
         "update jobs set state = $2, attempt = $3, attempt_limit = $4, worker = $5, cancel_requested = $6, \
          progress = $7, failure = $8, checkpoint_digest = $9, checkpoint_bytes = $10, version = $11, \
-         not_before = $12, started_at = $13, finished_at = $14, lease_until = $15 where id = $1",
+         not_before = $12, started_at = $13, finished_at = $14, lease_until = $15, holder = $16, holder_attempt = $17 \
+         where id = $1",
     )
     .bind(key(job.id))
     .bind(job.state.as_str())
@@ -223,6 +237,8 @@ async fn save_job(connection: &mut Connection, job: &Job) -> Result<()> {
     .bind(job.started_at.map(to_db))
     .bind(job.finished_at.map(to_db))
     .bind(job.lease_until.map(to_db))
+    .bind(job.holder.as_deref())
+    .bind(job.holder.as_ref().map(|_holder| i64::from(job.attempt.0)))
     .execute(connection)
     .await?;
     Ok(())
@@ -518,9 +534,12 @@ impl SqlStore {
         let (mut transaction, now) = self.begin().await?;
         let outcome = async {
             let mut job = lock_job(&mut transaction, job).await?;
-            let attempt = job.attempt;
+            let (attempt, had_ended) = (job.attempt, job.state.is_terminal());
             transition(&mut job, now).map_err(|refusal| refused(&job, attempt, refusal))?;
             save_job(&mut transaction, &job).await?;
+            if !had_ended {
+                announce(&mut transaction, &job, None, now).await?;
+            }
             Ok(job)
         }
         .await;
@@ -551,7 +570,7 @@ impl SqlStore {
 
         let mut insert = QueryBuilder::<Db>::new(
             "insert into jobs (id, collection, object, request_id, capture_digest, recipe_json, priority, labels, \
-             max_attempts, state, attempt, attempt_limit, cancel_requested, submitted_at, not_before) ",
+             max_attempts, state, attempt, attempt_limit, cancel_requested, submitted_at, not_before, traceparent) ",
         );
         insert.push_values(requests, |mut row, (_, id, request)| {
             let job = Job::submit(*id, request.request_id.clone(), request.spec.clone(), now);
@@ -569,7 +588,8 @@ impl SqlStore {
                 .push_bind(i64::from(job.attempt_limit))
                 .push_bind(job.cancel_requested)
                 .push_bind(to_db(job.submitted_at))
-                .push_bind(to_db(job.not_before));
+                .push_bind(to_db(job.not_before))
+                .push_bind(request.traceparent.as_deref());
         });
         insert
             .push(" on conflict (collection, request_id) do nothing")
@@ -693,6 +713,7 @@ impl SqlStore {
             for job in &mut jobs {
                 job.expire(now);
                 save_job(&mut transaction, job).await?;
+                announce(&mut transaction, job, None, now).await?;
             }
             sqlx::query("delete from workers where last_seen_at < $1")
                 .bind(to_db(now - seconds(WORKER_KEPT_SECS)))
@@ -714,6 +735,7 @@ impl SqlStore {
         connection: &mut Connection,
         collection: &CollectionId,
         worker: &WorkerId,
+        holder: Option<&str>,
         now: DateTime<Utc>,
     ) -> Result<Option<Job>> {
         if !has_room(connection, collection).await? {
@@ -730,7 +752,8 @@ impl SqlStore {
         let Some(row) = row else { return Ok(None) };
         let mut job = job_from(&row)?;
         let attempt = job.attempt;
-        job.lease(worker.clone(), now, self.settings.lease)
+        let holder = holder.map(str::to_owned);
+        job.lease(worker.clone(), holder, now, self.settings.lease)
             .map_err(|refusal| refused(&job, attempt, refusal))?;
         save_job(connection, &job).await?;
         Ok(Some(job))
@@ -1081,6 +1104,7 @@ impl Store for SqlStore {
     async fn lease_within(
         &self,
         worker: &WorkerInfo,
+        holder: Option<&str>,
         within: Option<&BTreeSet<CollectionId>>,
     ) -> Result<Option<Job>> {
         if self.touch_worker(worker).await? {
@@ -1095,7 +1119,7 @@ impl Store for SqlStore {
         let outcome = async {
             for collection in &collections {
                 let claimed = self
-                    .claim(&mut transaction, collection, &worker.id, now)
+                    .claim(&mut transaction, collection, &worker.id, holder, now)
                     .await?;
                 if claimed.is_some() {
                     return Ok(claimed);
@@ -1207,6 +1231,7 @@ impl Store for SqlStore {
         job.complete(attempt, version, now)
             .map_err(|refusal| refused(&job, attempt, refusal))?;
         save_job(&mut transaction, &job).await?;
+        announce(&mut transaction, &job, Some(&new.bundle), now).await?;
         let published = find_version(&mut transaction, &object, &format!("v{version}")).await?;
         Ok(published)
         }
@@ -1233,6 +1258,7 @@ impl Store for SqlStore {
                 )
                 .map_err(|refusal| refused(&job, attempt, refusal))?;
             save_job(&mut transaction, &job).await?;
+            announce(&mut transaction, &job, None, now).await?;
             append_logs(&mut transaction, job.id, attempt, logs).await?;
             Ok(will_retry)
         }

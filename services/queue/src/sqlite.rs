@@ -31,7 +31,13 @@ pub use sql::SqlStore as SqliteStore;
 
 const READERS: u32 = 4;
 
-static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("../../migrations/sqlite");
+/// What brings the schema up to date. One that is ahead, because a newer coordinator was here, is worked with: each step
+/// leaves the program before it working.
+fn migrations() -> sqlx::migrate::Migrator {
+    let mut migrations = sqlx::migrate!("../../migrations/sqlite");
+    migrations.set_ignore_missing(true);
+    migrations
+}
 
 // What sql.rs needs of its dialect.
 type Db = Sqlite;
@@ -124,7 +130,7 @@ pub(crate) async fn open(url: &str, settings: Settings) -> Result<SqliteStore> {
             .max_lifetime(None)
     };
     let writer = pool(1).connect_with(options.clone()).await?;
-    MIGRATIONS
+    migrations()
         .run(&writer)
         .await
         .map_err(crate::error::from_migration)?;

@@ -122,6 +122,9 @@ pub struct Job {
     pub attempt_limit: u32,
     /// Who holds it, or held it last; none while queued.
     pub worker: Option<WorkerId>,
+    /// Whose token or certificate leased the current attempt: reports about it come from nobody else. None while queued,
+    /// and where it is not known.
+    pub holder: Option<String>,
     /// Its worker is to stop at the next heartbeat.
     pub cancel_requested: bool,
     /// How far the current attempt is.
@@ -142,6 +145,8 @@ pub struct Job {
     pub finished_at: Option<DateTime<Utc>>,
     /// When the current lease runs out.
     pub lease_until: Option<DateTime<Utc>>,
+    /// W3C trace context of the call that submitted it.
+    pub traceparent: Option<String>,
 }
 
 /// Why a transition did not happen.
@@ -199,6 +204,7 @@ impl Job {
             attempt_limit: spec.max_attempts,
             spec,
             worker: None,
+            holder: None,
             cancel_requested: false,
             progress: None,
             failure: None,
@@ -209,13 +215,15 @@ impl Job {
             started_at: None,
             finished_at: None,
             lease_until: None,
+            traceparent: None,
         }
     }
 
-    /// Gives the job to a worker for `lease`.
+    /// Gives the job to a worker for `lease`; `holder` is who the worker is by its token or certificate.
     pub fn lease(
         &mut self,
         worker: WorkerId,
+        holder: Option<String>,
         now: DateTime<Utc>,
         lease: Duration,
     ) -> Result<(), Refusal> {
@@ -227,6 +235,7 @@ impl Job {
         }
         self.state = JobState::Leased;
         self.worker = Some(worker);
+        self.holder = holder;
         self.progress = None;
         self.started_at = Some(now);
         self.lease_until = Some(now + lease);
@@ -240,6 +249,11 @@ impl Job {
         } else {
             Err(Refusal::LeaseLost)
         }
+    }
+
+    /// Whether `attempt` is the last and was given out: from then on who holds it never changes.
+    pub fn is_taken(&self, attempt: Attempt) -> bool {
+        self.attempt == attempt && self.state != JobState::Queued
     }
 
     /// Extends the lease; answers whether the worker is to stop. A lease never becomes shorter.
@@ -358,6 +372,7 @@ impl Job {
         self.state = JobState::Queued;
         self.attempt = Attempt(self.attempt.0.saturating_add(1));
         self.worker = None;
+        self.holder = None;
         self.progress = None;
         self.lease_until = None;
         self.not_before = not_before;
@@ -387,8 +402,8 @@ impl Job {
                 "a leased job has started",
             ),
             (
-                self.state != JobState::Queued || self.worker.is_none(),
-                "a queued job has no worker",
+                self.state != JobState::Queued || (self.worker.is_none() && self.holder.is_none()),
+                "a queued job has no worker and no holder",
             ),
             (
                 self.state.is_terminal() == self.finished_at.is_some(),
@@ -499,7 +514,9 @@ mod tests {
         let current = job.attempt;
         let stale = Attempt(job.attempt.0 - 1);
         match op {
-            Op::Lease => job.lease("w".parse().unwrap(), now, LEASE).is_ok(),
+            Op::Lease => job
+                .lease("w".parse().unwrap(), Some("token".to_owned()), now, LEASE)
+                .is_ok(),
             Op::Heartbeat => job.heartbeat(current, None, now, LEASE).is_ok(),
             Op::Complete => job.complete(current, 1, now).is_ok(),
             Op::Fail(kind) => job.fail(current, failure(kind), now, &BACKOFF).is_ok(),
@@ -543,6 +560,9 @@ mod tests {
             }
             if matches!(op, Op::Lease) && done {
                 assert!(job.worker.is_none(), "leased twice");
+            }
+            if job.is_taken(job.attempt) && next.is_taken(job.attempt) {
+                assert_eq!(next.holder, job.holder, "another holder of one attempt");
             }
             if job.state == JobState::Leased && next.state == JobState::Queued {
                 assert_eq!(
@@ -591,11 +611,16 @@ mod tests {
         let now = DateTime::UNIX_EPOCH;
         job.not_before = now + Duration::from_secs(1);
         assert_eq!(
-            job.lease("w".parse().unwrap(), now, LEASE),
+            job.lease("w".parse().unwrap(), None, now, LEASE),
             Err(Refusal::NotYet)
         );
-        job.lease("w".parse().unwrap(), now + Duration::from_secs(1), LEASE)
-            .unwrap();
+        job.lease(
+            "w".parse().unwrap(),
+            None,
+            now + Duration::from_secs(1),
+            LEASE,
+        )
+        .unwrap();
         let until = job.lease_until;
         // A clock that was set back.
         job.heartbeat(Attempt(1), None, now, LEASE).unwrap();

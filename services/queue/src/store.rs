@@ -15,6 +15,7 @@ use ign_proto::{Attempt, CollectionId, Digest, JobId, ObjectId, ObjectName, Work
 use crate::changes::Changes;
 use crate::state::{Backoff, Checkpoint, Failure, Job, JobSpec, JobState, Level, Progress};
 use crate::token::Tokens;
+use crate::webhook::Webhooks;
 
 /// Lines kept of a job's log; older ones go.
 pub const MAX_LOG_LINES: u64 = 10_000;
@@ -117,6 +118,8 @@ pub struct Submit {
     pub request_id: String,
     /// What to bake; `max_attempts` 0 means the default.
     pub spec: JobSpec,
+    /// W3C trace context of the call; no part of what makes two submits the same.
+    pub traceparent: Option<String>,
 }
 
 /// Which jobs to list; empty fields do not filter.
@@ -347,7 +350,7 @@ pub struct Reaped {
 
 /// A durable queue of jobs with its registry of versions.
 #[async_trait]
-pub trait Store: Tokens + Send + Sync + std::fmt::Debug + 'static {
+pub trait Store: Tokens + Webhooks + Send + Sync + std::fmt::Debug + 'static {
     /// The times it works with.
     fn settings(&self) -> Settings;
 
@@ -402,13 +405,14 @@ pub trait Store: Tokens + Send + Sync + std::fmt::Debug + 'static {
     /// The next job for a worker: priority, then the collection with the fewest running jobs for its weight, then the
     /// one served longest ago, then age. None when there is nothing to do or the worker drains.
     async fn lease(&self, worker: &WorkerInfo) -> Result<Option<Job>> {
-        self.lease_within(worker, None).await
+        self.lease_within(worker, None, None).await
     }
 
-    /// As [`Store::lease`], from these collections alone; none for all.
+    /// As [`Store::lease`], for whom the caller's token or certificate says, from these collections alone; none for all.
     async fn lease_within(
         &self,
         worker: &WorkerInfo,
+        holder: Option<&str>,
         collections: Option<&BTreeSet<CollectionId>>,
     ) -> Result<Option<Job>>;
 

@@ -151,7 +151,10 @@ impl Registry {
     }
 
     /// Writes, reads, writes again and deletes one object; says whether the second create was refused.
-    async fn try_out(&self) -> Result<bool, RegistryError> {
+    ///
+    /// # Errors
+    /// The store does not do one of these.
+    pub async fn try_out(&self) -> Result<bool, RegistryError> {
         let path = self.path(&format!("probe/{}", Uuid::now_v7()));
         self.store
             .put(&path, "first".into())

@@ -9,7 +9,7 @@
 
 use std::io::Write;
 use std::net::TcpListener;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt as _};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -48,11 +48,21 @@ pub struct Postgres {
     port: u16,
     server: Mutex<Option<Child>>,
     databases: AtomicU32,
+    tls: bool,
 }
 
 impl Postgres {
     /// Makes a new cluster and starts it. Takes about a second.
     pub fn start() -> Result<Self> {
+        Self::start_with(None)
+    }
+
+    /// The same, for connections over TLS alone: with this certificate and its key, in PEM.
+    pub fn start_with_tls(certificate: &str, key: &str) -> Result<Self> {
+        Self::start_with(Some((certificate, key)))
+    }
+
+    fn start_with(tls: Option<(&str, &str)>) -> Result<Self> {
         let bin = find_binaries()?;
         let dir = tempfile::Builder::new().prefix("ign-pg-").tempdir()?.keep();
         let cluster = Self {
@@ -61,6 +71,7 @@ impl Postgres {
             port: free_port()?,
             server: Mutex::new(None),
             databases: AtomicU32::new(0),
+            tls: tls.is_some(),
         };
         if is_root()? {
             run(Command::new("chown").arg("postgres").arg(&cluster.dir))
@@ -77,8 +88,27 @@ impl Postgres {
                 "--locale=C",
                 "--no-sync",
             ]))?;
+        if let Some((certificate, key)) = tls {
+            cluster.write("server.crt", certificate)?;
+            cluster.write("server.key", key)?;
+            cluster.write(
+                "pg_hba.conf",
+                "local all all trust\nhostssl all all 127.0.0.1/32 trust\n",
+            )?;
+        }
         cluster.launch()?;
         Ok(cluster)
+    }
+
+    /// Writes a file of the cluster, as its server wants it.
+    fn write(&self, name: &str, text: &str) -> Result<()> {
+        let path = self.data().join(name);
+        std::fs::write(&path, text)?;
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600))?;
+        if is_root()? {
+            run(Command::new("chown").arg("postgres").arg(&path))?;
+        }
+        Ok(())
     }
 
     /// The cluster that all tests of this process share, started by the first caller.
@@ -170,6 +200,8 @@ impl Postgres {
                 "full_page_writes=off",
                 "-c",
                 "max_connections=300",
+                "-c",
+                if self.tls { "ssl=on" } else { "ssl=off" },
             ])
             .stdin(Stdio::piped())
             .stdout(Stdio::null())

@@ -37,7 +37,8 @@ impl Checkpoints {
     ) -> Self {
         let (newest, offered) = watch::channel(None);
         let sending = Arc::default();
-        let task = tokio::spawn(run(control, data, state, offered, Arc::clone(&sending)));
+        let work = run(control, data, state, offered, Arc::clone(&sending));
+        let task = tokio::spawn(ign_trace::carry(work));
         Self {
             newest,
             outbox,

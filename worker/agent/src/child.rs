@@ -77,7 +77,7 @@ pub(crate) struct Child {
 
 impl Child {
     /// Starts `command` on `job_file` in `dir`, with `threads` for every numeric library that reads them from the
-    /// environment.
+    /// environment, and the trace that this task works under.
     pub(crate) fn spawn(
         command: &ChildCommand,
         job_file: &Path,
@@ -93,6 +93,8 @@ impl Child {
             .env("MKL_NUM_THREADS", &threads)
             .env("RAYON_NUM_THREADS", &threads)
             .envs(command.envs.iter().map(|(name, value)| (name, value)))
+            .env_remove(ign_trace::VARIABLE)
+            .envs(ign_trace::current().map(|trace| (ign_trace::VARIABLE, trace.to_string())))
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

@@ -17,7 +17,7 @@ const DEADLINE: Duration = Duration::from_secs(15);
 /// Publishing checks every blob in the store.
 const COMPLETE_DEADLINE: Duration = Duration::from_mins(2);
 
-/// Adds the bearer token, where there is one, to every call.
+/// Adds the bearer token, where there is one, to every call, and the trace that it belongs to.
 #[derive(Clone, Debug)]
 struct Bearer(Option<MetadataValue<Ascii>>);
 
@@ -27,6 +27,11 @@ impl Interceptor for Bearer {
             request
                 .metadata_mut()
                 .insert("authorization", token.clone());
+        }
+        if let Some(trace) = ign_trace::current()
+            && let Ok(trace) = trace.to_string().parse()
+        {
+            request.metadata_mut().insert(ign_trace::HEADER, trace);
         }
         Ok(request)
     }

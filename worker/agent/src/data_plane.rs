@@ -346,8 +346,11 @@ async fn remove(path: &Path) -> Result<(), TransferError> {
     }
 }
 
-/// Sends a request and sorts the answer.
-async fn send(request: RequestBuilder, what: &str) -> Result<Response, TransferError> {
+/// Sends a request, under the trace of its job, and sorts the answer.
+async fn send(mut request: RequestBuilder, what: &str) -> Result<Response, TransferError> {
+    if let Some(trace) = ign_trace::current() {
+        request = request.header(ign_trace::HEADER, trace.to_string());
+    }
     let response = request.send().await.map_err(broken(what))?;
     let status = response.status();
     if status.is_success() {

@@ -21,6 +21,7 @@ pub(crate) async fn run(control: Control, state: Arc<State>, lease_secs: f64) {
     let mut interval = interval(lease_secs);
     let mut backoff = Backoff::new(Duration::from_millis(500), Duration::from_secs(10));
     let mut failing_since: Option<Instant> = None;
+    let mut draining = false;
     loop {
         let wait = match beat(&control, &state).await {
             Ok(response) => {
@@ -35,8 +36,8 @@ pub(crate) async fn run(control: Control, state: Arc<State>, lease_secs: f64) {
                 if response.cancel {
                     state.stop(Stop::Cancelled);
                 }
-                if response.drain {
-                    state.set_drain();
+                if response.drain && !std::mem::replace(&mut draining, true) {
+                    tracing::info!(job = %state.job, "draining: no other job after this one");
                 }
                 if state.logs().is_empty() {
                     let news = async {

@@ -14,6 +14,7 @@ use std::time::Duration;
 
 use ign_events::{Event, Failure, FailureKind, JobFile, Level, Progress};
 use ign_proto::{Attempt, Cause, Digest, IdError, JobId, ObjectName, v1};
+use ign_trace::TraceParent;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
@@ -48,21 +49,25 @@ impl From<TransferError> for Ended {
     }
 }
 
-/// What the agent does next.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Next {
-    Work,
-    Drain,
+/// Works on a lease until its job has ended, one way or another, within the trace that the lease names.
+pub(crate) async fn run(agent: &Agent, lease: v1::Lease, shutdown: &CancellationToken) {
+    let trace: Option<TraceParent> = lease.traceparent.parse().ok();
+    let span = tracing::info_span!(
+        "job",
+        job.id = lease.job_id,
+        job.attempt = lease.attempt,
+        trace.id = trace.map(|trace| trace.trace_id()),
+    );
+    ign_trace::within(span, trace, work_on(agent, lease, shutdown)).await;
 }
 
-/// Works on a lease until its job has ended, one way or another.
-pub(crate) async fn run(agent: &Agent, lease: v1::Lease, shutdown: &CancellationToken) -> Next {
+async fn work_on(agent: &Agent, lease: v1::Lease, shutdown: &CancellationToken) {
     let (state, spec) = match read_lease(agent, &lease) {
         Ok(read) => read,
         Err(error) => {
             // The lease runs out and another worker, perhaps a newer one, gets the job.
             tracing::error!(job = lease.job_id, "cannot understand the lease: {error}");
-            return Next::Work;
+            return;
         }
     };
     ign_faults::point("agent.leased");
@@ -70,11 +75,11 @@ pub(crate) async fn run(agent: &Agent, lease: v1::Lease, shutdown: &Cancellation
     let started = Instant::now();
     tracing::info!(job = %state.job, attempt = %state.attempt, object = %state.object, "job started");
     let mut background = JoinSet::new();
-    background.spawn(heartbeat::run(
+    background.spawn(ign_trace::carry(heartbeat::run(
         agent.control.clone(),
         Arc::clone(&state),
         lease.lease_secs,
-    ));
+    )));
     background.spawn({
         let (state, shutdown) = (Arc::clone(&state), shutdown.clone());
         async move {
@@ -115,11 +120,6 @@ pub(crate) async fn run(agent: &Agent, lease: v1::Lease, shutdown: &Cancellation
     }
     background.shutdown().await;
     remove_dir(dir).await;
-    if state.drain() {
-        Next::Drain
-    } else {
-        Next::Work
-    }
 }
 
 /// What the bake needs, checked.

@@ -41,7 +41,6 @@ use crate::backoff::Backoff;
 use crate::cache::Cache;
 use crate::control::Control;
 use crate::data_plane::DataPlane;
-use crate::job::Next;
 
 /// How one agent works.
 #[derive(Clone, Debug)]
@@ -109,7 +108,8 @@ struct Agent {
     _lock: File,
 }
 
-/// Works on jobs until `shutdown` is cancelled or the coordinator drains this worker.
+/// Works on jobs until `shutdown` is cancelled. A worker that is drained goes on asking, and gets nothing until the drain
+/// is taken back: only the coordinator knows.
 ///
 /// An unreachable coordinator is waited for, however long; only what a person must repair ends the agent.
 ///
@@ -139,10 +139,7 @@ pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<(),
                 }
                 backoff.reset();
                 let Some(lease) = lease else { continue };
-                if Box::pin(job::run(&agent, lease, &shutdown)).await == Next::Drain {
-                    tracing::info!("drained: taking no more jobs");
-                    break;
-                }
+                Box::pin(job::run(&agent, lease, &shutdown)).await;
                 continue;
             }
             Err(cause @ (Cause::Unauthenticated | Cause::Forbidden { .. })) => {

@@ -1,6 +1,5 @@
 //! What the parts of one attempt share: newest progress, log lines on their way, and the reasons to stop.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -27,8 +26,6 @@ pub(crate) struct State {
     pub(crate) attempt: Attempt,
     pub(crate) worker: WorkerId,
     pub(crate) object: ObjectName,
-    /// The coordinator asked this worker to take no more jobs.
-    drain: AtomicBool,
     progress: Mutex<Option<v1::Progress>>,
     logs: Mutex<LogBuffer>,
     /// Something new for the next heartbeat.
@@ -43,7 +40,6 @@ impl State {
             attempt,
             worker,
             object,
-            drain: AtomicBool::new(false),
             progress: Mutex::new(None),
             logs: Mutex::new(LogBuffer::new()),
             news: Notify::new(),
@@ -99,14 +95,6 @@ impl State {
     /// Ends when there is something new to tell.
     pub(crate) async fn news(&self) {
         self.news.notified().await;
-    }
-
-    pub(crate) fn set_drain(&self) {
-        self.drain.store(true, Ordering::Relaxed);
-    }
-
-    pub(crate) fn drain(&self) -> bool {
-        self.drain.load(Ordering::Relaxed)
     }
 
     /// Tells every part to stop; a weightier reason replaces a lighter one.

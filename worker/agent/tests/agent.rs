@@ -7,7 +7,7 @@ mod worker;
 
 use std::time::Duration;
 
-use fake::{Coordinator, End};
+use fake::{Coordinator, End, TRACE};
 use ign_agent::AgentError;
 use ign_proto::v1::FailureKind;
 use serde_json::json;
@@ -355,16 +355,38 @@ async fn a_shutdown_ends_even_when_nobody_answers() {
 }
 
 #[tokio::test]
-async fn a_drained_worker_finishes_its_job_and_ends() {
+async fn a_drained_worker_finishes_its_job_and_waits_for_the_end_of_the_drain() {
     let coordinator = Coordinator::start().await;
     let capture = coordinator.add_capture(SMALL);
-    coordinator.world().drain = true;
     let job = coordinator.queue(&capture, &json!([{"sleep_ms": 800}, {"done": 5}]));
     let waiting = coordinator.queue(&capture, &json!([{"done": 5}]));
     let worker = Worker::start(&coordinator.url);
+    coordinator
+        .until("the lease", |world| world.queue.len() == 1)
+        .await;
+    coordinator.world().drain = true;
     completed(coordinator.end_of(&job).await);
-    worker.task.await.unwrap().unwrap();
+    tokio::time::sleep(Duration::from_millis(500)).await;
     assert_eq!(coordinator.world().queue[0].job_id, waiting);
+    assert!(!worker.task.is_finished(), "it waits");
+    coordinator.world().drain = false;
+    completed(coordinator.end_of(&waiting).await);
+    worker.stop().await;
+}
+
+/// Also where nothing is exported.
+#[tokio::test]
+async fn the_trace_of_the_lease_reaches_the_child_and_comes_back_with_calls() {
+    let coordinator = Coordinator::start().await;
+    let capture = coordinator.add_capture(SMALL);
+    let job = coordinator.queue(&capture, &json!([{"env": "TRACEPARENT"}, {"done": 5}]));
+    let worker = Worker::start(&coordinator.url);
+    completed(coordinator.end_of(&job).await);
+    worker.stop().await;
+    let world = coordinator.world();
+    let told = world.log_after("TRACEPARENT=");
+    assert_eq!(told.as_deref(), Some(TRACE));
+    assert_eq!(world.traces, [TRACE.to_owned()].into());
 }
 
 #[tokio::test]

@@ -63,6 +63,7 @@ impl Service {
             limits: ign_coordinator::Limits::default(),
             redirect_blobs: true,
             care: ign_coordinator::Care::default(),
+            webhook_internal: Vec::new(),
         };
         let stop = CancellationToken::new();
         let running = ign_coordinator::serve(config, stop.clone().cancelled_owned())

@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use ign_coordinator::{Config, Rate};
-use ign_proto::{Cause, Digest, Scope, v1};
+use ign_proto::{Cause, Digest, Kind, Scope, v1};
 use prost::Message as _;
 use reqwest::{Method, StatusCode};
 
-use crate::fixture::{Clients, Service, TOKEN, attempt, object_ref, submit_request};
+use crate::fixture::{Clients, Service, TOKEN, attempt, manifest, object_ref, submit_request};
 
 /// What each RPC is asked, in the collection `museum`, and the scope that it takes.
 fn calls(job: &str) -> Vec<(&'static str, Vec<u8>, Scope)> {
@@ -132,6 +132,50 @@ fn calls(job: &str) -> Vec<(&'static str, Vec<u8>, Scope)> {
             .encode_to_vec(),
             Scope::Admin,
         ),
+        (
+            "Collections/SetWebhook",
+            v1::SetWebhookRequest {
+                collection: museum(),
+                url: "https://archive.example/hook".to_owned(),
+                secret: vec![7; 32],
+            }
+            .encode_to_vec(),
+            Scope::Admin,
+        ),
+        (
+            "Collections/ListWebhooks",
+            v1::ListWebhooksRequest {
+                collection: museum(),
+            }
+            .encode_to_vec(),
+            Scope::Admin,
+        ),
+        (
+            "Collections/ListDeliveries",
+            v1::ListDeliveriesRequest {
+                collection: museum(),
+                limit: 0,
+            }
+            .encode_to_vec(),
+            Scope::Admin,
+        ),
+        (
+            "Collections/Redeliver",
+            v1::RedeliverRequest {
+                collection: museum(),
+                id: "msg_unknown".to_owned(),
+            }
+            .encode_to_vec(),
+            Scope::Admin,
+        ),
+        (
+            "Collections/RemoveWebhook",
+            v1::RemoveWebhookRequest {
+                collection: museum(),
+            }
+            .encode_to_vec(),
+            Scope::Admin,
+        ),
     ]
 }
 
@@ -143,11 +187,13 @@ const OF_ALL_COLLECTIONS: [(&str, Scope); 3] = [
 ];
 
 /// Those for the holder of `admin` everywhere.
-const OF_OPERATORS: [&str; 8] = [
+const OF_OPERATORS: [&str; 10] = [
     "Admin/RebuildRegistry",
     "Admin/CollectGarbage",
     "Admin/AuditRegistry",
     "Admin/ListEvents",
+    "Admin/DrainWorkers",
+    "Admin/Diagnose",
     "Tokens/Create",
     "Tokens/List",
     "Tokens/Rotate",
@@ -340,9 +386,10 @@ async fn every_rpc_takes_its_scope_in_its_collection() {
                     ![PERMISSION_DENIED, UNAUTHENTICATED, UNIMPLEMENTED].contains(&status),
                     "{path} {grants:?}: {status}"
                 );
-                // The bundle is not there, but the job is.
+                // The bundle, the delivery and a webhook that was removed before are not there, but the job is.
+                let absent = ["Bundles", "Redeliver", "RemoveWebhook"];
                 assert!(
-                    status != NOT_FOUND || path.contains("Bundles"),
+                    status != NOT_FOUND || absent.iter().any(|it| path.contains(it)),
                     "{path} {grants:?}"
                 );
             } else {
@@ -847,4 +894,89 @@ async fn viewers_of_other_origins_may_ask() {
         .to_str()
         .unwrap();
     assert!(allowed.contains("authorization") && allowed.contains("range"));
+}
+
+#[tokio::test]
+async fn a_lease_belongs_to_the_token_that_took_it() {
+    let mut service = Service::start().await;
+    service.submit("museum/vase", "1").await;
+    let holder = service.token(&["publish:museum"]).await;
+    let (same, other) = (
+        service.token(&["publish:museum"]).await,
+        service.token(&["publish:*"]).await,
+    );
+    service.workers = Clients::new(&service.url, &holder).workers;
+    let lease = service.lease("w", 5.0).await.unwrap();
+    let state = service.upload("museum/vase", b"state").await;
+    service.upload("museum/vase", b"{}").await;
+
+    // Everything that another one says is refused: one of the same rights, one of more, the operator's.
+    let held = || Some(attempt(&lease, "w"));
+    let report = async |url: String, token: &str| {
+        let mut workers = Clients::new(&url, token).workers;
+        let heartbeat = v1::HeartbeatRequest {
+            job: held(),
+            ..v1::HeartbeatRequest::default()
+        };
+        let checkpoint = v1::CheckpointRequest {
+            job: held(),
+            digest: state.to_string(),
+            size_bytes: 5,
+        };
+        let complete = v1::CompleteRequest {
+            job: held(),
+            files: manifest(Kind::Bundle, &[("bundle.json", b"{}")])
+                .files()
+                .iter()
+                .map(Into::into)
+                .collect(),
+            metrics_json: "{}".to_owned(),
+        };
+        let fail = v1::FailRequest {
+            job: held(),
+            failure: Some(v1::Failure {
+                kind: v1::FailureKind::InvalidInput.into(),
+                ..v1::Failure::default()
+            }),
+            ..v1::FailRequest::default()
+        };
+        let refused = |status: tonic::Status| Cause::from_status(&status);
+        [
+            workers.heartbeat(heartbeat).await.map_err(refused).err(),
+            workers.checkpoint(checkpoint).await.map_err(refused).err(),
+            workers.complete(complete).await.map_err(refused).err(),
+            workers.fail(fail).await.map_err(refused).err(),
+        ]
+    };
+    for token in [&same, &other, TOKEN] {
+        for refused in report(service.url.clone(), token).await {
+            assert!(
+                matches!(refused, Some(Cause::Forbidden { .. })),
+                "{refused:?}"
+            );
+        }
+    }
+    let untouched = service.get(&lease.job_id).await;
+    assert_eq!(untouched.state(), v1::JobState::Leased);
+    assert_eq!(untouched.checkpoint_digest, "");
+
+    // A restart forgets nothing of this, and a rotated token is the same token.
+    service.restart().await;
+    for refused in report(service.url.clone(), &same).await {
+        assert!(
+            matches!(refused, Some(Cause::Forbidden { .. })),
+            "{refused:?}"
+        );
+    }
+    let rotated = service.rotate(&holder, 0.0).await;
+    service.workers = Clients::new(&service.url, &rotated).workers;
+    let heartbeat = v1::HeartbeatRequest {
+        job: held(),
+        ..v1::HeartbeatRequest::default()
+    };
+    service.workers.heartbeat(heartbeat).await.unwrap();
+    let done = service
+        .complete(&lease, "w", &[("bundle.json", b"{}")])
+        .await;
+    assert_eq!(done.unwrap().version, 1);
 }

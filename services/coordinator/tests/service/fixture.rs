@@ -91,6 +91,7 @@ impl Service {
             behind_tls_proxy: false,
             limits: Limits::default(),
             care: Care::default(),
+            webhook_internal: Vec::new(),
         };
         change(&mut config);
         let http = reqwest::Client::new();

@@ -7,7 +7,7 @@ use ign_proto::v1;
 use reqwest::{Method, StatusCode};
 use tokio_stream::StreamExt as _;
 
-use crate::fixture::Service;
+use crate::fixture::{Service, attempt};
 
 #[tokio::test]
 async fn a_waiting_worker_gets_a_new_job_at_once() {
@@ -125,6 +125,7 @@ async fn a_coordinator_that_cannot_work_says_why() {
             limits: ign_coordinator::Limits::default(),
             redirect_blobs: false,
             care: ign_coordinator::Care::default(),
+            webhook_internal: Vec::new(),
         };
         change(&mut config);
         ign_coordinator::serve(config, std::future::pending())
@@ -145,4 +146,43 @@ async fn a_coordinator_that_cannot_work_says_why() {
         .await
         .unwrap_err();
     assert!(matches!(error, ServeError::Endpoint { .. }), "{error}");
+}
+
+#[tokio::test]
+async fn a_drained_worker_finishes_and_gets_work_again_when_the_drain_ends() {
+    let mut service = Service::start().await;
+    service.submit("museum/vase", "1").await;
+    service.submit("museum/urn", "2").await;
+    let lease = service.lease("w", 5.0).await.unwrap();
+    let drain = |names: &[&str], draining| v1::DrainWorkersRequest {
+        worker_ids: names.iter().map(ToString::to_string).collect(),
+        draining,
+    };
+    let drained = service.admin.drain_workers(drain(&["w"], true)).await;
+    let drained = drained.unwrap().into_inner().workers;
+    assert_eq!(drained.len(), 1);
+    assert!(drained[0].draining && drained[0].job_id == lease.job_id);
+    let heartbeat = v1::HeartbeatRequest {
+        job: Some(attempt(&lease, "w")),
+        ..v1::HeartbeatRequest::default()
+    };
+    let told = service.workers.heartbeat(heartbeat).await.unwrap();
+    assert!(told.into_inner().drain);
+    service
+        .complete(&lease, "w", &[("bundle.json", b"{}")])
+        .await
+        .unwrap();
+    assert_eq!(service.lease("w", 0.3).await, None);
+    let absent = service.admin.drain_workers(drain(&["nobody"], true)).await;
+    assert_eq!(absent.unwrap_err().code(), tonic::Code::NotFound);
+
+    // All of them, and a long poll that waits hears of it at once.
+    let mut admin = service.admin.clone();
+    let begun = Instant::now();
+    let (lease, undrained) = tokio::join!(service.lease("w", 20.0), async {
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        admin.drain_workers(drain(&[], false)).await.unwrap()
+    });
+    assert!(lease.is_some() && begun.elapsed() < Duration::from_secs(10));
+    assert!(!undrained.into_inner().workers[0].draining);
 }

@@ -20,6 +20,8 @@ pub(crate) const PATIENT: Settings = Settings {
     poll: Duration::from_millis(500),
 };
 
+pub(crate) const TRACE: &str = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01";
+
 /// A way into the database around the store.
 enum Beside {
     Sqlite(sqlx::SqlitePool),
@@ -113,6 +115,12 @@ impl Bench {
         .await;
     }
 
+    /// Makes every delivery that waits due now.
+    pub(crate) async fn end_pauses(&self) {
+        self.execute(format!("update deliveries set next_at = {}", self.past()))
+            .await;
+    }
+
     /// Makes it long ago that the job ended.
     pub(crate) async fn end_long_ago(&self, job: JobId) {
         self.execute(format!(
@@ -161,6 +169,7 @@ pub(crate) fn request(object: &str) -> Submit {
     Submit {
         request_id: JobId::generate().to_string(),
         spec: spec(object),
+        traceparent: Some(TRACE.to_owned()),
     }
 }
 

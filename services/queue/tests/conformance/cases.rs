@@ -13,9 +13,12 @@ use ign_queue::{
 pub(crate) use crate::tokens::{
     tokens_rotate_expire_and_end, workers_stay_within_their_collections,
 };
+pub(crate) use crate::webhooks::{
+    deliveries_go_on_until_they_are_taken_or_given_up, ends_are_announced,
+};
 
 use crate::bench::{
-    Bench, PATIENT, after, bundle, digest, failure, kind, name, request, spec, worker,
+    Bench, PATIENT, TRACE, after, bundle, digest, failure, kind, name, request, spec, worker,
 };
 
 fn line(source_seq: u64, message: &str) -> NewLogLine {
@@ -54,12 +57,22 @@ pub(crate) async fn submits_are_idempotent(bench: &Bench) {
     let elsewhere = Submit {
         request_id: first.request_id.clone(),
         spec: spec("library/vase"),
+        traceparent: None,
     };
     assert_ne!(bench.store.submit(elsewhere).await.unwrap().id, job.id);
 
     // Also when the job has moved on, and when the same request comes many times at once.
     bench.lease("w").await.unwrap();
-    assert_eq!(bench.store.submit(first).await.unwrap().id, job.id);
+    // The trace is that of the first call.
+    let repeated = Submit {
+        traceparent: None,
+        ..first
+    };
+    let same = bench.store.submit(repeated).await.unwrap();
+    assert_eq!(
+        (same.id, same.traceparent.as_deref()),
+        (job.id, Some(TRACE))
+    );
     let racing = request("museum/urn");
     let mut tasks = tokio::task::JoinSet::new();
     for _ in 0..16 {
@@ -393,6 +406,50 @@ pub(crate) async fn concurrent_publications_of_one_object_get_distinct_versions(
             .version,
         8
     );
+}
+
+pub(crate) async fn a_holder_is_that_of_its_attempt(bench: &Bench) {
+    let store = &bench.store;
+    let submitted = bench.submit("museum/vase").await;
+    let lease = async |holder| {
+        let leased = store.lease_within(&worker("w"), holder, None).await;
+        leased.unwrap().unwrap()
+    };
+    let first = lease(Some("token-a")).await;
+    assert_eq!(first.holder.as_deref(), Some("token-a"));
+    assert_eq!(store.get(first.id).await.unwrap(), first);
+    assert!(first.is_taken(first.attempt) && !first.is_taken(after(first.attempt)));
+    bench.end_lease(first.id).await;
+    store.reap().await.unwrap();
+    let queued = store.get(first.id).await.unwrap();
+    assert_eq!(queued.holder, None);
+    assert!(!queued.is_taken(queued.attempt));
+    let second = lease(Some("token-b")).await;
+    assert_eq!(second.holder.as_deref(), Some("token-b"));
+
+    // An older coordinator takes it back and leases it, and does not know of holders.
+    bench
+        .execute(format!(
+            "update jobs set attempt = attempt + 1 where id = '{}'",
+            submitted.id
+        ))
+        .await;
+    let third = store.get(first.id).await.unwrap();
+    assert_eq!((third.attempt, third.holder), (after(second.attempt), None));
+}
+
+/// A coordinator that was not upgraded yet starts beside one that was.
+pub(crate) async fn a_newer_schema_is_worked_with(bench: &Bench) {
+    bench
+        .execute(
+            "insert into _sqlx_migrations (version, description, success, checksum, execution_time) \
+             values (999999, 'of a later release', true, '', 0)"
+                .to_owned(),
+        )
+        .await;
+    let older = bench.open(PATIENT).await;
+    older.submit(request("museum/vase")).await.unwrap();
+    assert!(bench.lease("w").await.is_some());
 }
 
 pub(crate) async fn stale_attempts_change_nothing(bench: &Bench) {

@@ -10,6 +10,7 @@ mod migrations;
 mod model;
 mod postgres_only;
 mod tokens;
+mod webhooks;
 
 macro_rules! conformance {
     ($($case:ident),* $(,)?) => {
@@ -29,6 +30,8 @@ macro_rules! conformance {
 }
 
 conformance![
+    a_holder_is_that_of_its_attempt,
+    a_newer_schema_is_worked_with,
     aliases_and_retirement,
     attempts_run_out_and_retry_gives_new_ones,
     backoff_ends_by_itself,
@@ -37,7 +40,9 @@ conformance![
     changes_between_query_and_wait_are_not_missed,
     concurrent_publications_of_one_object_get_distinct_versions,
     data_outlive_the_store,
+    deliveries_go_on_until_they_are_taken_or_given_up,
     drained_workers_get_nothing,
+    ends_are_announced,
     events_and_turns,
     failures_decide_by_kind,
     find_takes_unambiguous_prefixes,

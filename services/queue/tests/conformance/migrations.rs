@@ -8,6 +8,9 @@ use sqlx::migrate::Migrator;
 static FOR_POSTGRES: Migrator = sqlx::migrate!("../../migrations/postgres");
 static FOR_SQLITE: Migrator = sqlx::migrate!("../../migrations/sqlite");
 
+/// The last step.
+const NEWEST: i64 = 23;
+
 /// Columns of the first schema, in every table.
 const FIRST: [(&str, &str); 7] = [
     ("collections", "name, weight, max_running, paused"),
@@ -57,13 +60,15 @@ impl Database {
             Self::Postgres(pool) => {
                 let sql = sql
                     .replace("{at}", "timestamptz '2026-01-02 03:04:05.678901+00'")
-                    .replace("{true}", "true");
+                    .replace("{true}", "true")
+                    .replace("{bytes}", "'\\x00ff'::bytea");
                 sqlx::query(AssertSqlSafe(sql)).execute(pool).await.unwrap();
             }
             Self::Sqlite(pool) => {
                 let sql = sql
                     .replace("{at}", "1767323045678901")
-                    .replace("{true}", "1");
+                    .replace("{true}", "1")
+                    .replace("{bytes}", "x'00ff'");
                 sqlx::query(AssertSqlSafe(sql)).execute(pool).await.unwrap();
             }
         }
@@ -203,8 +208,23 @@ impl Database {
         }
         self.up(2).await;
         assert_eq!(self.first_schema().await, down);
+
+        // The later steps only add: the program before goes on beside them, and nothing is lost on the way back.
+        self.up(NEWEST).await;
+        assert_eq!(self.first_schema().await, down);
+        self.execute("update jobs set state = 'leased', worker = 'w', lease_until = {at} where request_id = 'r4'")
+            .await;
+        self.execute(
+            "insert into webhooks values ('museum', 'https://archive.example', {bytes}, {at})",
+        )
+        .await;
+        let both = self.first_schema().await;
+        self.down(2).await;
+        assert_eq!(self.first_schema().await, both);
+        self.up(NEWEST).await;
+        assert_eq!(self.first_schema().await, both);
         self.down(0).await;
-        self.up(2).await;
+        self.up(NEWEST).await;
     }
 }
 

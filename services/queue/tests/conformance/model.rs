@@ -128,7 +128,7 @@ impl Model {
         let id = self.next()?;
         let now = self.now();
         let job = self.jobs.get_mut(&id)?;
-        job.lease(me.parse().expect("a name"), now, PATIENT.lease)
+        job.lease(me.parse().expect("a name"), None, now, PATIENT.lease)
             .expect("it is ready");
         Some(job.clone())
     }
@@ -400,6 +400,7 @@ async fn run(bench: &Bench, seed: u64, steps: u64) {
                 let request = Submit {
                     request_id: format!("r{number}"),
                     spec,
+                    traceparent: None,
                 };
                 let result = store.submit(request.clone()).await;
                 let expected = model.submit(&request, result.as_ref().ok().map(|job| job.id));
@@ -409,6 +410,7 @@ async fn run(bench: &Bench, seed: u64, steps: u64) {
                 let request = model.jobs.get(&target).map(|job| Submit {
                     request_id: job.request_id.clone(),
                     spec: job.spec.clone(),
+                    traceparent: None,
                 });
                 if let Some(request) = request {
                     let expected = model.submit(&request, None);

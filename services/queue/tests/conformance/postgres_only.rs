@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use ign_queue::{Settings, StoreError};
 use ign_testkit::Postgres;
+use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 
 use crate::bench::{Bench, PATIENT, request, worker};
 
@@ -228,4 +229,50 @@ async fn a_transaction_held_open_holds_up_its_rows_alone_and_not_for_ever() {
     );
     transaction.rollback().await.unwrap();
     bench.store.cancel(held.id).await.unwrap();
+}
+
+/// `sslmode=verify-full`: the certificate must be the authority's and name the host; nothing is said in plain text.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_connection_is_encrypted_and_the_server_is_who_it_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut params = CertificateParams::default();
+    params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    let key = KeyPair::generate().unwrap();
+    let ca = dir.path().join("ca.pem");
+    std::fs::write(&ca, params.self_signed(&key).unwrap().pem()).unwrap();
+    let issuer = Issuer::new(params, key);
+    let other = dir.path().join("other.pem");
+    let stranger = rcgen::generate_simple_self_signed(["127.0.0.1".to_owned()]).unwrap();
+    std::fs::write(&other, stranger.cert.pem()).unwrap();
+    let server = |name: &str| {
+        let key = KeyPair::generate().unwrap();
+        let params = CertificateParams::new([name.to_owned()]).unwrap();
+        let certificate = params.signed_by(&key, &issuer).unwrap().pem();
+        Postgres::start_with_tls(&certificate, &key.serialize_pem()).unwrap()
+    };
+    let verified = |url: &str, ca: &std::path::Path| {
+        format!("{url}?sslmode=verify-full&sslrootcert={}", ca.display())
+    };
+
+    let here = server("127.0.0.1");
+    let url = here.create_database().unwrap();
+    let store = ign_queue::open(&verified(&url, &ca), PATIENT)
+        .await
+        .unwrap();
+    let job = store.submit(request("museum/vase")).await.unwrap();
+    assert_eq!(store.get(job.id).await.unwrap(), job);
+    let encrypted = here.execute(
+        "postgres",
+        "select bool_and(ssl) from pg_stat_ssl join pg_stat_activity using (pid) where application_name = 'ign'",
+    );
+    assert_eq!(encrypted.unwrap(), "t");
+    // The password of a URL is not sent to whoever listens there.
+    for wrong in [verified(&url, &other), format!("{url}?sslmode=disable")] {
+        let refused = ign_queue::open(&wrong, PATIENT).await;
+        assert!(refused.is_err(), "{wrong}");
+    }
+    let elsewhere = server("db.example");
+    let url = elsewhere.create_database().unwrap();
+    let refused = ign_queue::open(&verified(&url, &ca), PATIENT).await;
+    assert!(refused.is_err(), "a certificate of another host");
 }

@@ -108,7 +108,7 @@ pub(crate) async fn workers_stay_within_their_collections(bench: &Bench) {
         let collections = within(name);
         let leased = bench
             .store
-            .lease_within(&worker("w"), Some(&collections))
+            .lease_within(&worker("w"), Some("token"), Some(&collections))
             .await;
         leased.unwrap().map(|job| job.id)
     };

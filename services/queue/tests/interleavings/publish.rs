@@ -186,7 +186,7 @@ impl World for Publishing {
                 Worker::Idle | Worker::Heard { .. } => {
                     let mut next = self.clone();
                     let id = format!("w{index}").parse().unwrap();
-                    if next.job.lease(id, now(), LEASE).is_ok() {
+                    if next.job.lease(id, None, now(), LEASE).is_ok() {
                         next.workers[index] = Worker::Bakes {
                             attempt: next.job.attempt,
                             uploaded: false,

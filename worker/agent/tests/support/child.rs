@@ -106,6 +106,10 @@ fn main() {
                     std::fs::read_to_string(path).unwrap()
                 ));
             }
+            "env" => log(format!(
+                "{text}={}",
+                std::env::var(text).unwrap_or_default()
+            )),
             "checkpoint" => {
                 checkpoints += 1;
                 let path = job.work_dir.join(format!("checkpoint-{checkpoints}"));

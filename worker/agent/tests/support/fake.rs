@@ -17,6 +17,8 @@ use ign_proto::v1::workers_server::{Workers, WorkersServer};
 use ign_proto::{Cause, Digest, FileEntry, JobId, Kind, Manifest, v1};
 
 const LEASE_SECS: f64 = 1.0;
+/// Trace context of every lease.
+pub(crate) const TRACE: &str = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01";
 
 /// How an attempt ended, as the coordinator heard it.
 #[derive(Clone, Debug)]
@@ -41,6 +43,8 @@ pub(crate) struct World {
     pub(crate) cancel: HashSet<String>,
     pub(crate) lost: HashSet<String>,
     pub(crate) drain: bool,
+    /// What heartbeats say that they belong to.
+    pub(crate) traces: std::collections::BTreeSet<String>,
     /// Nothing is served.
     pub(crate) down: bool,
     /// The next blob downloads break off after this many bytes.
@@ -143,6 +147,7 @@ impl Coordinator {
             ..v1::JobSpec::default()
         };
         self.world().queue.push_back(v1::Lease {
+            traceparent: TRACE.to_owned(),
             job_id: job_id.into(),
             attempt,
             spec: Some(spec),
@@ -349,7 +354,14 @@ impl Workers for Coordinator {
         let wait = Duration::from_secs_f64(request.into_inner().wait_secs);
         let started = Instant::now();
         loop {
-            let lease = self.world().queue.pop_front();
+            let lease = {
+                let mut world = self.world();
+                if world.drain {
+                    None
+                } else {
+                    world.queue.pop_front()
+                }
+            };
             if lease.is_some() || started.elapsed() > wait {
                 return Ok(tonic::Response::new(v1::LeaseResponse { lease }));
             }
@@ -361,9 +373,13 @@ impl Workers for Coordinator {
         &self,
         request: tonic::Request<v1::HeartbeatRequest>,
     ) -> Result<tonic::Response<v1::HeartbeatResponse>, tonic::Status> {
+        let trace = request.metadata().get("traceparent").cloned();
         let request = request.into_inner();
         let job = self.check(request.job.as_ref())?;
         let mut world = self.world();
+        world
+            .traces
+            .extend(trace.map(|trace| trace.to_str().unwrap().to_owned()));
         world.heartbeats += 1;
         world.progress.extend(request.progress);
         world

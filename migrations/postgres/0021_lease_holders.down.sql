@@ -1,0 +1,2 @@
+alter table jobs drop column holder_attempt;
+alter table jobs drop column holder;
