@@ -225,3 +225,8 @@ pub fn kill_now(pid: u32) -> Result<()> {
         Err(error) => Err(error.into()),
     }
 }
+
+/// A path as an argument.
+pub fn path(path: &Path) -> Result<&str> {
+    path.to_str().context("the path is no UTF-8")
+}

@@ -1,8 +1,6 @@
 //! The service in its two forms: as many processes on Postgres and S3, and embedded in one `ignctl up`.
 
-use std::collections::BTreeMap;
 use std::fs;
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -11,7 +9,9 @@ use ign_testkit::Postgres;
 use tempfile::TempDir;
 
 use crate::client::{Client, Job};
-use crate::process::{Process, descendants, kill_now, program, wait_until};
+use crate::coordinator::{Coordinator, Setup};
+use crate::process::{Process, descendants, kill_now, path, program, wait_until};
+use crate::s3::S3;
 
 /// Time for a process to start listening, also on a loaded machine.
 const START_LIMIT: Duration = Duration::from_mins(1);
@@ -26,12 +26,9 @@ const TOKEN: &str = "ign-e2e-token-0123456789abcdef0123456789abcdef";
 pub struct Stack {
     // Dropped in this order: clients before what they use.
     workers: Vec<Process>,
-    coordinator: Process,
-    _s3: Process,
+    coordinator: Coordinator,
+    _s3: S3,
     postgres: Postgres,
-    database: String,
-    env: BTreeMap<String, String>,
-    listen: String,
     /// Everything on disk.
     pub dir: TempDir,
 }
@@ -42,57 +39,25 @@ impl Stack {
         let dir = tempfile::Builder::new().prefix("ign-e2e-").tempdir()?;
         let postgres = Postgres::start()?;
         let database = postgres.create_database()?;
-        let bucket = "bundles";
-        let s3 = Process::start(
-            "S3 endpoint",
-            &program("s3-endpoint")?,
-            [
-                "--root",
-                path(&dir.path().join("s3"))?,
-                "--bucket",
-                bucket,
-                "--access-key",
-                ACCESS_KEY,
-                "--secret-key",
-                SECRET_KEY,
-                "--exit-when-stdin-closes",
-            ],
-            [],
-            &dir.path().join("s3.log"),
-        )?;
-        let endpoint = wait_until("the S3 endpoint's address", START_LIMIT, || {
-            Ok(s3
-                .output()
-                .lines()
-                .find(|line| line.starts_with("http://"))
-                .map(str::to_owned))
-        })?;
-        let env = BTreeMap::from(
-            [
-                ("AWS_ENDPOINT", endpoint.as_str()),
-                ("AWS_ACCESS_KEY_ID", ACCESS_KEY),
-                ("AWS_SECRET_ACCESS_KEY", SECRET_KEY),
-                ("AWS_REGION", "us-east-1"),
-                ("AWS_ALLOW_HTTP", "true"),
-                ("AWS_VIRTUAL_HOSTED_STYLE_REQUEST", "false"),
-            ]
-            .map(|(name, value)| (name.to_owned(), value.to_owned())),
-        );
+        let s3 = S3::start(dir.path(), ACCESS_KEY, SECRET_KEY)?;
         fs::write(dir.path().join("token"), TOKEN)?;
-        // The same port again after a restart, as behind a service name.
-        let listen = TcpListener::bind("127.0.0.1:0")?.local_addr()?.to_string();
-        let coordinator = start_coordinator(&dir, &listen, &database, &env)?;
+        let mut coordinator = Coordinator::start(Setup {
+            name: "coordinator".to_owned(),
+            dir: dir.path().to_owned(),
+            database,
+            store: s3.url(),
+            token_file: dir.path().join("token"),
+            args: vec!["--lease-secs".to_owned(), LEASE_SECS.to_string()],
+            env: s3.env().clone(),
+        })?;
+        coordinator.await_ready()?;
         let mut stack = Self {
             workers: Vec::new(),
             coordinator,
             _s3: s3,
             postgres,
-            database,
-            env,
-            listen,
             dir,
         };
-        stack.await_service()?;
         for number in 1..=workers {
             let name = format!("worker-{number}");
             let worker = stack.start_worker(&name)?;
@@ -111,7 +76,7 @@ impl Stack {
 
     /// `http://127.0.0.1:PORT`.
     pub fn url(&self) -> String {
-        format!("http://{}", self.listen)
+        self.coordinator.url()
     }
 
     /// The Postgres cluster.
@@ -137,8 +102,8 @@ impl Stack {
 
     /// Starts the coordinator again, on the same address.
     pub fn restart_coordinator(&mut self) -> Result<()> {
-        self.coordinator = start_coordinator(&self.dir, &self.listen, &self.database, &self.env)?;
-        self.await_service()
+        self.coordinator.replace(None)?;
+        self.coordinator.await_ready()
     }
 
     /// Names of the workers that run.
@@ -147,18 +112,6 @@ impl Stack {
             .iter_mut()
             .filter_map(|w| w.is_running().then(|| w.name().to_owned()))
             .collect()
-    }
-
-    fn await_service(&mut self) -> Result<()> {
-        let client = self.client()?;
-        wait_until("the coordinator", START_LIMIT, || {
-            ensure!(
-                self.coordinator.is_running(),
-                "the coordinator ended:\n{}",
-                self.coordinator.output()
-            );
-            Ok(client.run(&["status"])?.status.success().then_some(()))
-        })
     }
 
     fn start_worker(&self, name: &str) -> Result<Process> {
@@ -183,32 +136,6 @@ impl Stack {
             &self.dir.path().join(format!("{name}.log")),
         )
     }
-}
-
-fn start_coordinator(
-    dir: &TempDir,
-    listen: &str,
-    database: &str,
-    env: &BTreeMap<String, String>,
-) -> Result<Process> {
-    Process::start(
-        "coordinator",
-        &program("ign-coordinator")?,
-        [
-            "--listen",
-            listen,
-            "--database",
-            database,
-            "--store",
-            "s3://bundles/e2e",
-            "--token-file",
-            path(&dir.path().join("token"))?,
-            "--lease-secs",
-            &LEASE_SECS.to_string(),
-        ],
-        env.clone(),
-        &dir.path().join("coordinator.log"),
-    )
 }
 
 /// `ignctl up` on a data folder that survives it.
@@ -285,8 +212,4 @@ fn start_embedded(data: &Path, workers: usize) -> Result<Process> {
         )],
         &data.with_extension("log"),
     )
-}
-
-fn path(path: &Path) -> Result<&str> {
-    path.to_str().context("the path is no UTF-8")
 }

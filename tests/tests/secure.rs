@@ -2,13 +2,15 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::net::TcpListener;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ign_e2e::{Client, Demo, Process, demo_capture, descendants, program, wait_until};
+use ign_e2e::{
+    Client, Coordinator, Demo, Process, S3, Setup, demo_capture, descendants, path, program,
+    wait_until,
+};
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 
 const START_LIMIT: Duration = Duration::from_mins(1);
@@ -48,10 +50,6 @@ impl Authority {
         fs::write(&secret, key.serialize_pem())?;
         Ok((cert, secret, key.serialize_pem()))
     }
-}
-
-fn text(path: &Path) -> Result<&str> {
-    path.to_str().context("the path is no UTF-8")
 }
 
 /// Files below `dir` that hold one of the secrets, with the secret's name.
@@ -94,67 +92,30 @@ fn a_bake_over_tls_leaves_no_secret_anywhere() -> Result<()> {
     fs::write(kept.join("root"), ROOT)?;
     fs::set_permissions(kept.join("root"), fs::Permissions::from_mode(0o600))?;
 
-    let s3 = Process::start(
-        "S3 endpoint",
-        &program("s3-endpoint")?,
-        [
-            "--root",
-            text(&seen.join("s3"))?,
-            "--bucket",
-            "bundles",
-            "--access-key",
-            S3_ACCESS,
-            "--secret-key",
-            S3_SECRET,
-            "--exit-when-stdin-closes",
-        ],
-        [],
-        &seen.join("s3.log"),
-    )?;
-    let endpoint = wait_until("the S3 endpoint's address", START_LIMIT, || {
-        let output = s3.output();
-        Ok(output
-            .lines()
-            .find(|line| line.starts_with("http://"))
-            .map(str::to_owned))
-    })?;
-    let env = [
-        ("AWS_ENDPOINT", endpoint.as_str()),
-        ("AWS_ACCESS_KEY_ID", S3_ACCESS),
-        ("AWS_SECRET_ACCESS_KEY", S3_SECRET),
-        ("AWS_REGION", "us-east-1"),
-        ("AWS_ALLOW_HTTP", "true"),
-        ("AWS_VIRTUAL_HOSTED_STYLE_REQUEST", "false"),
-        ("IGN_LOG", "debug"),
-    ]
-    .map(|(name, value)| (name.to_owned(), value.to_owned()));
-    let listen = TcpListener::bind("127.0.0.1:0")?.local_addr()?.to_string();
-    let mut coordinator = Process::start(
-        "coordinator",
-        &program("ign-coordinator")?,
-        [
-            "--listen",
-            &listen,
-            "--database",
-            &format!("sqlite://{}", text(&seen.join("ign.db"))?),
-            "--store",
-            "s3://bundles/e2e",
-            "--token-file",
-            text(&kept.join("root"))?,
-            "--tls-cert",
-            text(&cert)?,
-            "--tls-key",
-            text(&key)?,
-            "--client-ca",
-            text(&workers.file)?,
-        ],
+    let s3 = S3::start(&seen, S3_ACCESS, S3_SECRET)?;
+    let mut env = s3.env().clone();
+    env.insert("IGN_LOG".to_owned(), "debug".to_owned());
+    let args = [
+        "--tls-cert",
+        path(&cert)?,
+        "--tls-key",
+        path(&key)?,
+        "--client-ca",
+        path(&workers.file)?,
+    ];
+    let mut coordinator = Coordinator::start(Setup {
+        name: "coordinator".to_owned(),
+        dir: seen.clone(),
+        database: format!("sqlite://{}", path(&seen.join("ign.db"))?),
+        store: s3.url(),
+        token_file: kept.join("root"),
+        args: args.map(str::to_owned).into(),
         env,
-        &seen.join("coordinator.log"),
-    )?;
-    let url = format!("https://{listen}");
+    })?;
+    let url = format!("https://{}", coordinator.address());
     let client = |token: &str| -> Result<Client> {
-        Ok(Client::of_server(&url, text(&kept.join(token))?)
-            .with(&["--ca-file", text(&servers.file)?]))
+        Ok(Client::of_server(&url, path(&kept.join(token))?)
+            .with(&["--ca-file", path(&servers.file)?]))
     };
     let root = client("root")?;
     wait_until("the coordinator", START_LIMIT, || {
@@ -166,7 +127,7 @@ fn a_bake_over_tls_leaves_no_secret_anywhere() -> Result<()> {
         Ok(root.run(&["status"])?.status.success().then_some(()))
     })?;
     // Whoever does not know the authority is not talked to.
-    let stranger = Client::of_server(&url, text(&kept.join("root"))?).run(&["status"])?;
+    let stranger = Client::of_server(&url, path(&kept.join("root"))?).run(&["status"])?;
     ensure!(stranger.status.code() == Some(3), "{stranger:?}");
 
     let token_file = kept.join("registrar");
@@ -179,7 +140,7 @@ fn a_bake_over_tls_leaves_no_secret_anywhere() -> Result<()> {
         "--allow",
         "read:museum",
         "--out",
-        text(&token_file)?,
+        path(&token_file)?,
     ])?;
     ensure!(fs::metadata(&token_file)?.permissions().mode() & 0o777 == 0o600);
     let token = fs::read_to_string(&token_file)?.trim().to_owned();
@@ -193,13 +154,13 @@ fn a_bake_over_tls_leaves_no_secret_anywhere() -> Result<()> {
             "--server",
             &url,
             "--ca-file",
-            text(&servers.file)?,
+            path(&servers.file)?,
             "--client-cert",
-            text(&worker_cert)?,
+            path(&worker_cert)?,
             "--client-key",
-            text(&worker_key)?,
+            path(&worker_key)?,
             "--work-dir",
-            text(&seen.join("work"))?,
+            path(&seen.join("work"))?,
             "--name",
             "worker-1",
             "--threads",
@@ -215,7 +176,7 @@ fn a_bake_over_tls_leaves_no_secret_anywhere() -> Result<()> {
         "museum/vase",
         &["--size", "32", "--budget-secs", "5"],
     )?;
-    let elsewhere = registrar.run(&["submit", text(&capture)?, "--object", "library/vase"])?;
+    let elsewhere = registrar.run(&["submit", path(&capture)?, "--object", "library/vase"])?;
     ensure!(elsewhere.status.code() == Some(1), "{elsewhere:?}");
 
     let secrets = [

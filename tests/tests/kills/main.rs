@@ -64,8 +64,8 @@ fn cycle(cluster: &mut Cluster, number: u64, fault: &str, restart_postgres: bool
     };
     let script = json!([{"checkpoint": "half"}, {"sleep_ms": bake_ms}, {"done": 100}]);
     let request_id = format!("request-{number}");
-    let job = cluster.insist("submit", &mut look, async |cluster| {
-        cluster.submit(&object, &request_id, &script).await
+    let job = cluster.insist("submit", &mut look, async |api| {
+        api.submit(&object, &request_id, &script).await
     })?;
     if restart_postgres {
         cluster.postgres.restart()?;
@@ -73,7 +73,7 @@ fn cycle(cluster: &mut Cluster, number: u64, fault: &str, restart_postgres: bool
     let begun = Instant::now();
     let ended = loop {
         look(cluster)?;
-        let now = cluster.insist("get", &mut look, async |cluster| cluster.get(&job.id).await)?;
+        let now = cluster.insist("get", &mut look, async |api| api.get(&job.id).await)?;
         if matches!(
             now.state(),
             v1::JobState::Succeeded | v1::JobState::Failed | v1::JobState::Cancelled
@@ -90,8 +90,8 @@ fn cycle(cluster: &mut Cluster, number: u64, fault: &str, restart_postgres: bool
         ended.state() == v1::JobState::Succeeded,
         "{fault}: {ended:?}"
     );
-    let again = cluster.insist("submit again", &mut look, async |cluster| {
-        cluster.submit(&object, &request_id, &script).await
+    let again = cluster.insist("submit again", &mut look, async |api| {
+        api.submit(&object, &request_id, &script).await
     })?;
     ensure!(
         again.id == job.id,
@@ -146,7 +146,7 @@ fn every_fault_point_is_killed_at_and_nothing_is_lost_or_doubled() -> Result<()>
         .collect();
     ensure!(never.is_empty(), "never reached: {never:?}");
 
-    let versions = cluster.insist("list", revive, async |cluster| cluster.versions().await)?;
+    let versions = cluster.insist("list", revive, async |api| api.versions().await)?;
     let objects: BTreeSet<String> = versions
         .iter()
         .map(|version| version.object.clone().unwrap_or_default().object)
@@ -189,7 +189,7 @@ fn a_worker_frozen_before_its_publish_changes_nothing_when_it_wakes() -> Result<
     let job = cluster.insist(
         "submit",
         |_| Ok(()),
-        async |cluster| cluster.submit("museum/vase", "request-1", &script).await,
+        async |api| api.submit("museum/vase", "request-1", &script).await,
     )?;
     // Its bundle is sent; it stops before it says so.
     let frozen = cluster.agents["frozen"].pid();
@@ -201,11 +201,7 @@ fn a_worker_frozen_before_its_publish_changes_nothing_when_it_wakes() -> Result<
     cluster.replace_agent("fresh", None)?;
     let begun = Instant::now();
     let ended = loop {
-        let now = cluster.insist(
-            "get",
-            |_| Ok(()),
-            async |cluster| cluster.get(&job.id).await,
-        )?;
+        let now = cluster.insist("get", |_| Ok(()), async |api| api.get(&job.id).await)?;
         if now.state() == v1::JobState::Succeeded {
             break now;
         }
@@ -229,13 +225,9 @@ fn a_worker_frozen_before_its_publish_changes_nothing_when_it_wakes() -> Result<
         );
         std::thread::sleep(Duration::from_millis(50));
     }
-    let now = cluster.insist(
-        "get",
-        |_| Ok(()),
-        async |cluster| cluster.get(&job.id).await,
-    )?;
+    let now = cluster.insist("get", |_| Ok(()), async |api| api.get(&job.id).await)?;
     ensure!(now == ended, "the job changed: {now:?}");
-    let versions = cluster.insist("list", |_| Ok(()), async |cluster| cluster.versions().await)?;
+    let versions = cluster.insist("list", |_| Ok(()), async |api| api.versions().await)?;
     ensure!(versions.len() == 1, "{versions:?}");
     let after = (cluster.bucket()?, files(&cluster.store().join("versions"))?);
     ensure!(
@@ -267,14 +259,10 @@ fn a_killed_workers_job_runs_elsewhere_within_60_seconds() -> Result<()> {
     let job = cluster.insist(
         "submit",
         |_| Ok(()),
-        async |cluster| cluster.submit("museum/vase", "request-1", &script).await,
+        async |api| api.submit("museum/vase", "request-1", &script).await,
     )?;
     let state = |cluster: &mut Cluster| {
-        cluster.insist(
-            "get",
-            |_| Ok(()),
-            async |cluster| cluster.get(&job.id).await,
-        )
+        cluster.insist("get", |_| Ok(()), async |api| api.get(&job.id).await)
     };
     let begun = Instant::now();
     while state(&mut cluster)?.checkpoint_digest.is_empty() {
