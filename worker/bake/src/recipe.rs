@@ -42,7 +42,8 @@ pub struct Recipe {
     pub crop: Crop,
     /// Of every random choice.
     pub seed: u64,
-    /// Seconds of training at most; all stages together. `None`: as many steps as the settings say.
+    /// Seconds of training at most, all stages of ours together; methods compared with it get as many again. `None`: as many
+    /// steps as the settings say.
     pub budget_secs: Option<f64>,
     /// Proxy mesh inside the capture, when not the default one.
     pub proxy: Option<String>,
