@@ -57,7 +57,7 @@ impl Event {
 /// How far a bake is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
-    /// `import`, `plan`, `effects`, `composition`, `ablation`, `comparison`, `evaluate` or `pack`.
+    /// `import`, `plan`, `effects`, `composition`, `comparison`, `evaluate` or `pack`.
     pub stage: String,
     /// Of the whole bake, 0 to 100.
     pub percent: f64,

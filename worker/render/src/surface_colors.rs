@@ -83,9 +83,10 @@ impl SurfaceColors {
             .into_par_iter()
             .flat_map_iter(|triangle| lattice(mesh, triangle, steps[triangle]))
             .collect();
+        let outside = outside(&places, references);
         let texels = places
             .chunks(CHUNK)
-            .flat_map(|chunk| colors(chunk, references))
+            .flat_map(|chunk| colors(chunk, outside, references))
             .collect();
         Self {
             steps,
@@ -220,49 +221,62 @@ fn footprint(references: &References) -> f64 {
     sizes.get(sizes.len() / 2).copied().unwrap_or(1.0)
 }
 
-/// The texel rule on the references' device.
-fn colors(places: &[(DVec3, DVec3)], references: &References) -> Vec<[f32; 4]> {
+/// What the reference views see of surface points, on their device: cosines [n, V], signed, 0 where a view does not see the
+/// point; and colours [n, V, 3].
+fn observed(places: &[(DVec3, DVec3)], references: &References) -> (Tensor, Tensor) {
+    let device = references.colors.device();
+    let flat = |pick: fn(&(DVec3, DVec3)) -> DVec3| {
+        let values: Vec<f32> = places
+            .iter()
+            .flat_map(|place| pick(place).as_vec3().to_array())
+            .collect();
+        Tensor::from_slice(&values).view([-1, 3]).to_device(device)
+    };
+    let (points, normals) = (flat(|p| p.0), flat(|p| p.1));
+    let n = points.size()[0];
+    let (mut cosines, mut colors) = (Vec::new(), Vec::new());
+    for view in 0..references.len() as i64 {
+        let index = Tensor::full([n], view, (Kind::Int64, device));
+        let center = references.sources.centers().narrow(0, view, 1);
+        let cosine = (directions(&center, &points) * &normals).sum_dim_intlist(
+            [1i64].as_slice(),
+            true,
+            Kind::Float,
+        );
+        let facing = &normals * cosine.sign();
+        let taps = references
+            .sources
+            .taps(&points, &facing, &index)
+            .weighted(&references.alpha);
+        let seen = taps.visibility.gt(SEEN).to_kind(Kind::Float);
+        cosines.push(cosine.view([-1]) * seen);
+        colors.push(taps.gather(&references.colors) / taps.visibility.clamp_min(1e-4).unsqueeze(1));
+    }
+    (Tensor::stack(&cosines, 1), Tensor::stack(&colors, 1))
+}
+
+/// 1 where a mesh's normals point outwards, -1 where it is wound the other way: the outside is what is seen more. Decided once
+/// for the mesh: through a thin wall, views of its other side may seem to see a point of this one.
+fn outside(places: &[(DVec3, DVec3)], references: &References) -> f64 {
+    let stride = places.len().div_ceil(CHUNK).max(1);
+    let sample: Vec<(DVec3, DVec3)> = places.iter().step_by(stride).copied().collect();
+    let (cosines, _) = no_grad(|| observed(&sample, references));
+    if cosines.sum(Kind::Double).double_value(&[]) < 0.0 {
+        -1.0
+    } else {
+        1.0
+    }
+}
+
+/// The texel rule.
+fn colors(places: &[(DVec3, DVec3)], outside: f64, references: &References) -> Vec<[f32; 4]> {
     no_grad(|| {
-        let device = references.colors.device();
-        let flat = |pick: fn(&(DVec3, DVec3)) -> DVec3| {
-            let values: Vec<f32> = places
-                .iter()
-                .flat_map(|place| pick(place).as_vec3().to_array())
-                .collect();
-            Tensor::from_slice(&values).view([-1, 3]).to_device(device)
-        };
-        let (points, normals) = (flat(|p| p.0), flat(|p| p.1));
-        let n = points.size()[0];
-        let (mut cosines, mut colors) = (Vec::new(), Vec::new());
-        for view in 0..references.len() as i64 {
-            let index = Tensor::full([n], view, (Kind::Int64, device));
-            let center = references.sources.centers().narrow(0, view, 1);
-            let cosine = (directions(&center, &points) * &normals).sum_dim_intlist(
-                [1i64].as_slice(),
-                true,
-                Kind::Float,
-            );
-            let facing = &normals * cosine.sign();
-            let taps = references
-                .sources
-                .taps(&points, &facing, &index)
-                .weighted(&references.alpha);
-            let seen = taps.visibility.gt(SEEN).to_kind(Kind::Float);
-            cosines.push(cosine.view([-1]) * seen);
-            colors.push(
-                taps.gather(&references.colors) / taps.visibility.clamp_min(1e-4).unsqueeze(1),
-            );
-        }
-        let best = VIEWS.min(references.len()) as i64;
-        // Meshes may be wound either way: the outside is where more is seen from.
-        let cosines = Tensor::stack(&cosines, 1);
-        let side = cosines
-            .sum_dim_intlist([1i64].as_slice(), true, Kind::Float)
-            .sign();
+        let (cosines, colors) = observed(places, references);
+        let (n, best) = (places.len() as i64, VIEWS.min(references.len()) as i64);
         // [n, best]
-        let (weights, views) = (cosines * side).clamp_min(0.0).topk(best, 1, true, true);
+        let (weights, views) = (cosines * outside).clamp_min(0.0).topk(best, 1, true, true);
         let views = views.unsqueeze(2).expand([n, best, 3], false);
-        let colors = Tensor::stack(&colors, 1).gather(1, &views, false);
+        let colors = colors.gather(1, &views, false);
         let total = weights.sum_dim_intlist([1i64].as_slice(), true, Kind::Float);
         let mean =
             (colors * weights.unsqueeze(2)).sum_dim_intlist([1i64].as_slice(), false, Kind::Float)
