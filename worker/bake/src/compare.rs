@@ -51,7 +51,7 @@ impl Rivals {
             }
             let (from, to) = (at as f64, at as f64 + 1.0);
             let count = wanted.len() as f64;
-            session.reporter.part(from / count, to / count);
+            session.reporter.span(from / count, to / count);
             rivals.push((method, rival(trainer, session, ours, chosen, method)?));
         }
         Ok(Self(rivals))

@@ -18,7 +18,9 @@ pub(crate) struct Reporter<'a> {
 
 struct State {
     shares: Shares,
-    /// Part of the stage that steps report on.
+    /// Part of the stage that one of its several trainings is.
+    span: (f64, f64),
+    /// Part of that which steps report on.
     part: (f64, f64),
     started: Instant,
     /// Percent at the start: a resumed bake does not begin at 0, and its estimate must not either.
@@ -37,6 +39,7 @@ impl<'a> Reporter<'a> {
             sink,
             state: RefCell::new(State {
                 shares: shares(0),
+                span: (0.0, 1.0),
                 part: (0.0, 1.0),
                 started: now,
                 first_percent: None,
@@ -54,7 +57,14 @@ impl<'a> Reporter<'a> {
         self.state.borrow_mut().shares = shares(methods);
     }
 
-    /// Says which part of the stage the next steps are.
+    /// Says which part of the stage the next parts are.
+    pub(crate) fn span(&self, from: f64, to: f64) {
+        let mut state = self.state.borrow_mut();
+        state.span = (from, to);
+        state.part = (0.0, 1.0);
+    }
+
+    /// Says which part of the stage, or of its present span, the next steps are.
     pub(crate) fn part(&self, from: f64, to: f64) {
         self.state.borrow_mut().part = (from, to);
     }
@@ -65,6 +75,7 @@ impl<'a> Reporter<'a> {
             let mut state = self.state.borrow_mut();
             close_stage(&mut state);
             state.stage = stage;
+            state.span = (0.0, 1.0);
             state.part = (0.0, 1.0);
             state.last_sent = None;
         }
@@ -91,8 +102,8 @@ impl<'a> Reporter<'a> {
             .iter()
             .find(|(name, _)| *name == state.stage)
             .map_or(0.0, |(_, share)| *share);
-        let (from, to) = state.part;
-        let fraction = from + (to - from) * fraction.clamp(0.0, 1.0);
+        let within = |(from, to): (f64, f64), fraction: f64| from + (to - from) * fraction;
+        let fraction = within(state.span, within(state.part, fraction.clamp(0.0, 1.0)));
         let percent = 100.0 * (before + share * fraction) / total;
         let first = *state.first_percent.get_or_insert(percent);
         let done = percent - first;

@@ -57,6 +57,7 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
     };
     let scene = ign_capture::import(&job.capture_dir, &options)?;
     let settings = job.recipe.resolve(scene.train.len())?;
+    reporter.expect(settings.trained_methods());
     reporter.step(0.2, "comparing the photographs at common surface points");
     let survey = Survey::new(&scene);
     let estimated = Gains::estimate(&scene, &survey);
@@ -106,7 +107,6 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         data: &data,
         drawn: &drawn,
     };
-    reporter.expect(settings.trained_methods());
     let (ours, mut plan) = trainer.ours(&mut session)?;
     let rivals = Rivals::train(&trainer, &mut session, &ours, &chosen)?;
     note_capture(&mut plan, &preflight, &gains);

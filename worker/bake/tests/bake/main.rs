@@ -168,8 +168,16 @@ fn all_methods_are_scored_beside_ours() {
         let methods = [&cheap[..], trained].concat();
         let mut recipe = recipe(&[("effects", "on"), ("methods", &methods.join(","))]);
         recipe.preset = serde_json::from_value(preset.into()).expect("a preset");
-        let folder =
-            bake(&job(&capture, &dir.path().join(preset), recipe), &|_| {}).expect("a bake");
+        let percent = RefCell::new(Vec::new());
+        let folder = bake(&job(&capture, &dir.path().join(preset), recipe), &|event| {
+            if let Event::Progress(progress) = event {
+                percent.borrow_mut().push(progress.percent);
+            }
+        })
+        .expect("a bake");
+        let percent = percent.into_inner();
+        let rises = percent.windows(2).all(|pair| pair[0] <= pair[1] + 1e-9);
+        assert!(rises, "{preset}: {percent:?}");
         let bundle = Bundle::open(&folder).expect("it verifies");
         let metrics = bundle.metrics().expect("metrics").expect("metrics.json");
         let rows: Vec<&str> = metrics
