@@ -185,6 +185,8 @@ pub(crate) fn wire_failure(failure: &Failure) -> v1::Failure {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
 
     fn state() -> State {
@@ -207,13 +209,15 @@ mod tests {
         assert_eq!(state.stopped(Duration::ZERO).await, Stop::LeaseLost);
     }
 
-    #[tokio::test(start_paused = true)]
+    #[tokio::test]
     async fn a_shutdown_leaves_time_to_finish() {
         let state = state();
         state.stop(Stop::Shutdown);
-        let start = tokio::time::Instant::now();
-        assert_eq!(state.stopped(Duration::from_secs(5)).await, Stop::Shutdown);
-        assert_eq!(start.elapsed(), Duration::from_secs(5));
+        let (start, grace) = (Instant::now(), Duration::from_millis(100));
+        assert_eq!(state.stopped(grace).await, Stop::Shutdown);
+        assert!(start.elapsed() >= grace);
+        let waiting = state.stopped(Duration::from_mins(1));
+        assert!(tokio::time::timeout(grace, waiting).await.is_err());
     }
 
     #[test]
