@@ -34,6 +34,31 @@ pub(crate) fn from_commit(source: sqlx::Error) -> StoreError {
     }
 }
 
+/// The error of a transaction, for one more of the calls that shared it.
+pub(crate) fn shared(error: &StoreError) -> StoreError {
+    match error {
+        StoreError::Unavailable {
+            determinate,
+            source,
+        } => StoreError::Unavailable {
+            determinate: *determinate,
+            source: sqlx::Error::Io(std::io::Error::other(source.to_string())),
+        },
+        other => StoreError::Internal {
+            message: other.to_string(),
+            source: None,
+        },
+    }
+}
+
+/// An error for a call whose transaction was cut off before its end was known.
+pub(crate) fn cut_off() -> StoreError {
+    StoreError::Unavailable {
+        determinate: false,
+        source: sqlx::Error::WorkerCrashed,
+    }
+}
+
 /// An error while the schema was brought up to date.
 pub(crate) fn from_migration(error: sqlx::migrate::MigrateError) -> StoreError {
     match error {

@@ -14,6 +14,7 @@ use std::sync::Arc;
 pub mod changes;
 mod check;
 mod error;
+mod group;
 pub mod postgres;
 pub mod sqlite;
 pub mod state;

@@ -7,7 +7,8 @@
 //! Every change of a job is: lock its row, apply the pure transition of [`crate::state`], write it back, commit, signal.
 //! Lock order where one transaction takes several: collection, job, object.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::cmp::Ordering;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -23,7 +24,8 @@ use super::{
 };
 use crate::changes::{Change, Changes, Signal};
 use crate::check;
-use crate::error::from_commit;
+use crate::error::{cut_off, from_commit, shared};
+use crate::group::Group;
 use crate::state::{Checkpoint, Failure, Job, JobSpec, JobState, Level, Progress, Refusal};
 use crate::store::{
     Adopted, Collection, Event, JobFilter, JobPage, LogLine, MAX_EVENTS, MAX_LOG_LINE_BYTES,
@@ -62,6 +64,8 @@ pub struct SqlStore {
     backend: Backend,
     signal: Arc<Signal>,
     settings: Settings,
+    leases: Group<LeaseAsk, Result<Option<Job>>>,
+    publishes: Group<PublishAsk, Option<Result<Version>>>,
 }
 
 fn sql(text: String) -> AssertSqlSafe<String> {
@@ -215,33 +219,46 @@ async fn lock_job(connection: &mut Connection, job: JobId) -> Result<Job> {
     })?)
 }
 
-async fn save_job(connection: &mut Connection, job: &Job) -> Result<()> {
-    sqlx::query(
-        "update jobs set state = $2, attempt = $3, attempt_limit = $4, worker = $5, cancel_requested = $6, \
-         progress = $7, failure = $8, checkpoint_digest = $9, checkpoint_bytes = $10, version = $11, \
-         not_before = $12, started_at = $13, finished_at = $14, lease_until = $15, holder = $16, holder_attempt = $17 \
-         where id = $1",
-    )
-    .bind(key(job.id))
-    .bind(job.state.as_str())
-    .bind(i64::from(job.attempt.0))
-    .bind(i64::from(job.attempt_limit))
-    .bind(job.worker.as_ref().map(WorkerId::as_str))
-    .bind(job.cancel_requested)
-    .bind(job.progress.as_ref().map(Json))
-    .bind(job.failure.as_ref().map(Json))
-    .bind(job.checkpoint.as_ref().map(|checkpoint| checkpoint.digest.as_str()))
-    .bind(job.checkpoint.as_ref().map(|checkpoint| checkpoint.size_bytes as i64))
-    .bind(job.version.map(i64::from))
-    .bind(to_db(job.not_before))
-    .bind(job.started_at.map(to_db))
-    .bind(job.finished_at.map(to_db))
-    .bind(job.lease_until.map(to_db))
-    .bind(job.holder.as_deref())
-    .bind(job.holder.as_ref().map(|_holder| i64::from(job.attempt.0)))
-    .execute(connection)
-    .await?;
+/// Writes jobs back whose rows are locked.
+async fn save_jobs(connection: &mut Connection, jobs: &[Job]) -> Result<()> {
+    for chunk in jobs.chunks(CHUNK) {
+        let mut update = QueryBuilder::<Db>::new(
+            "update jobs set state = v.column2, attempt = v.column3, attempt_limit = v.column4, worker = v.column5, \
+             cancel_requested = v.column6, progress = v.column7, failure = v.column8, checkpoint_digest = v.column9, \
+             checkpoint_bytes = v.column10, version = v.column11, not_before = v.column12, started_at = v.column13, \
+             finished_at = v.column14, lease_until = v.column15, holder = v.column16, holder_attempt = v.column17 from (",
+        );
+        update.push_values(chunk, |mut row, job| {
+            let checkpoint = job.checkpoint.as_ref();
+            row.push_bind(key(job.id))
+                .push_bind(job.state.as_str())
+                .push_bind(i64::from(job.attempt.0))
+                .push_bind(i64::from(job.attempt_limit))
+                .push_bind(job.worker.as_ref().map(WorkerId::as_str))
+                .push_bind(job.cancel_requested)
+                .push_bind(job.progress.as_ref().map(Json))
+                .push_bind(job.failure.as_ref().map(Json))
+                .push_bind(checkpoint.map(|it| it.digest.as_str()))
+                .push_bind(checkpoint.map(|it| it.size_bytes as i64))
+                .push_bind(job.version.map(i64::from))
+                .push_bind(to_db(job.not_before))
+                .push_bind(job.started_at.map(to_db))
+                .push_bind(job.finished_at.map(to_db))
+                .push_bind(job.lease_until.map(to_db))
+                .push_bind(job.holder.as_deref())
+                .push_bind(job.holder.as_ref().map(|_holder| i64::from(job.attempt.0)));
+        });
+        update
+            .push(") v where jobs.id = v.column1")
+            .build()
+            .execute(&mut *connection)
+            .await?;
+    }
     Ok(())
+}
+
+async fn save_job(connection: &mut Connection, job: &Job) -> Result<()> {
+    save_jobs(connection, std::slice::from_ref(job)).await
 }
 
 fn refused(job: &Job, attempt: Attempt, refusal: Refusal) -> StoreError {
@@ -406,37 +423,51 @@ async fn point_alias(
     alias: &str,
     version: u32,
 ) -> Result<()> {
-    sqlx::query(
-        "insert into aliases (collection, object, alias, version) values ($1, $2, $3, $4) \
-         on conflict (collection, object, alias) do update set version = excluded.version",
-    )
-    .bind(object.collection.as_str())
-    .bind(object.object.as_str())
-    .bind(alias)
-    .bind(i64::from(version))
-    .execute(connection)
-    .await?;
+    point_aliases(connection, alias, [(object, version)]).await
+}
+
+/// Points one alias of each of several objects.
+async fn point_aliases(
+    connection: &mut Connection,
+    alias: &str,
+    targets: impl IntoIterator<Item = (&ObjectName, u32)>,
+) -> Result<()> {
+    let mut insert = QueryBuilder::<Db>::new(
+        "insert into aliases (collection, object, alias, version) ",
+    );
+    insert.push_values(targets, |mut row, (object, version)| {
+        row.push_bind(object.collection.as_str())
+            .push_bind(object.object.as_str())
+            .push_bind(alias)
+            .push_bind(i64::from(version));
+    });
+    insert
+        .push(" on conflict (collection, object, alias) do update set version = excluded.version")
+        .build()
+        .execute(connection)
+        .await?;
     Ok(())
 }
 
-async fn insert_version(connection: &mut Connection, version: &Version) -> Result<()> {
-    sqlx::query(
+async fn insert_versions(connection: &mut Connection, versions: &[Version]) -> Result<()> {
+    let mut insert = QueryBuilder::<Db>::new(
         "insert into versions (collection, object, version, manifest_digest, size_bytes, file_count, metrics_json, \
-         job_id, created_at, retired, retired_at) values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11)",
-    )
-    .bind(version.object.collection.as_str())
-    .bind(version.object.object.as_str())
-    .bind(i64::from(version.version))
-    .bind(version.bundle.manifest_digest.as_str())
-    .bind(version.bundle.size_bytes as i64)
-    .bind(i64::from(version.bundle.file_count))
-    .bind(&version.bundle.metrics_json)
-    .bind(key(version.job))
-    .bind(to_db(version.created_at))
-    .bind(version.retired)
-    .bind(version.retired_at.map(to_db))
-    .execute(connection)
-    .await?;
+         job_id, created_at, retired, retired_at) ",
+    );
+    insert.push_values(versions, |mut row, version| {
+        row.push_bind(version.object.collection.as_str())
+            .push_bind(version.object.object.as_str())
+            .push_bind(i64::from(version.version))
+            .push_bind(version.bundle.manifest_digest.as_str())
+            .push_bind(version.bundle.size_bytes as i64)
+            .push_bind(i64::from(version.bundle.file_count))
+            .push_bind(version.bundle.metrics_json.as_str())
+            .push_bind(key(version.job))
+            .push_bind(to_db(version.created_at))
+            .push_bind(version.retired)
+            .push_bind(version.retired_at.map(to_db));
+    });
+    insert.build().execute(connection).await?;
     Ok(())
 }
 
@@ -499,6 +530,8 @@ impl SqlStore {
             backend,
             signal,
             settings,
+            leases: Group::default(),
+            publishes: Group::default(),
         }
     }
 
@@ -640,62 +673,192 @@ impl SqlStore {
             .collect())
     }
 
-    /// Notes that a worker is there; answers whether it drains.
-    async fn touch_worker(&self, worker: &WorkerInfo) -> Result<bool> {
-        let worker = check::worker(worker);
-        let mut reader = self.backend.reader().acquire().await?;
-        let now = Backend::now(&mut reader).await?;
-        let known = sqlx::query(
-            "select hostname, version, device, last_seen_at, draining from workers where id = $1",
-        )
-        .bind(worker.id.as_str())
-        .fetch_optional(&mut *reader)
-        .await?;
-        drop(reader);
-        if let Some(row) = known {
-            let same = row.try_get::<&str, _>("hostname")? == worker.hostname
-                && row.try_get::<&str, _>("version")? == worker.version
-                && row.try_get::<&str, _>("device")? == worker.device;
-            if same && time(&row, "last_seen_at")? + seconds(WORKER_FRESH_SECS) > now {
-                return Ok(row.try_get("draining")?);
+    /// Notes that workers are there; answers which of them drain. Those that were seen a moment ago cost a read alone.
+    async fn touch_workers(
+        &self,
+        reader: &mut Connection,
+        workers: BTreeMap<WorkerId, WorkerInfo>,
+        now: DateTime<Utc>,
+    ) -> Result<BTreeSet<WorkerId>> {
+        let mut select = QueryBuilder::<Db>::new("select * from workers where id in (");
+        let mut ids = select.separated(", ");
+        for id in workers.keys() {
+            ids.push_bind(id.as_str());
+        }
+        let rows = select.push(")").build().fetch_all(reader).await?;
+        let mut draining = BTreeSet::new();
+        let mut stale = workers;
+        for row in rows {
+            let known = worker_from(&row)?;
+            let fresh = time(&row, "last_seen_at")? + seconds(WORKER_FRESH_SECS) > now;
+            if row.try_get("draining")? {
+                draining.insert(known.id.clone());
+            }
+            if fresh && stale.get(&known.id) == Some(&known) {
+                stale.remove(&known.id);
             }
         }
+        if stale.is_empty() {
+            return Ok(draining);
+        }
+        let mut insert = QueryBuilder::<Db>::new(
+            "insert into workers (id, hostname, version, device, last_seen_at) ",
+        );
+        insert.push_values(stale.values(), |mut row, worker| {
+            row.push_bind(worker.id.as_str())
+                .push_bind(worker.hostname.as_str())
+                .push_bind(worker.version.as_str())
+                .push_bind(worker.device.as_str())
+                .push_bind(to_db(now));
+        });
+        insert.push(
+            " on conflict (id) do update set hostname = excluded.hostname, version = excluded.version, \
+             device = excluded.device, last_seen_at = excluded.last_seen_at",
+        );
         let mut transaction = self.backend.begin().await?;
-        let row = sqlx::query(
-            "insert into workers (id, hostname, version, device, last_seen_at) values ($1, $2, $3, $4, $5) \
-             on conflict (id) do update set hostname = excluded.hostname, version = excluded.version, \
-             device = excluded.device, last_seen_at = excluded.last_seen_at returning draining",
-        )
-        .bind(worker.id.as_str())
-        .bind(worker.hostname)
-        .bind(worker.version)
-        .bind(worker.device)
-        .bind(to_db(now))
-        .fetch_one(&mut *transaction)
-        .await?;
+        insert.build().execute(&mut *transaction).await?;
         transaction.commit().await.map_err(from_commit)?;
-        Ok(row.try_get("draining")?)
+        Ok(draining)
     }
 
-    /// Collections with something to lease, in the order in which they are served.
-    async fn eligible(&self) -> Result<Vec<CollectionId>> {
+    /// The next jobs for some workers, each as if it had asked alone, in their order.
+    async fn lease_all(&self, asks: &[LeaseAsk]) -> Result<Vec<Option<Job>>> {
         let mut reader = self.backend.reader().acquire().await?;
         let now = Backend::now(&mut reader).await?;
-        let rows = sqlx::query(
-            "select c.name from collections c \
-             left join (select collection, count(*) as running from jobs where state = 'leased' group by collection) r \
-             on r.collection = c.name \
-             join jobs j on j.id = (select q.id from jobs q where q.collection = c.name and q.state = 'queued' \
-             and q.not_before <= $1 order by q.priority desc, q.submitted_at, q.id limit 1) \
-             where not c.paused and (c.max_running = 0 or coalesce(r.running, 0) < c.max_running) \
-             order by j.priority desc, coalesce(r.running, 0) / c.weight, \
-             (select max(s.started_at) from jobs s where s.collection = c.name and s.started_at is not null) \
-             nulls first, j.submitted_at, j.id",
-        )
-        .bind(to_db(now))
-        .fetch_all(&mut *reader)
-        .await?;
-        rows.iter().map(|row| parse(row.try_get("name")?)).collect()
+        let workers = asks
+            .iter()
+            .map(|ask| (ask.worker.id.clone(), check::worker(&ask.worker)))
+            .collect();
+        let draining = self.touch_workers(&mut reader, workers, now).await?;
+        let mut queues = waiting_queues(&mut reader, now).await?;
+        drop(reader);
+        let served = |ask: &LeaseAsk, queues: &[Queue]| {
+            !draining.contains(&ask.worker.id) && queues.iter().any(|queue| ask.takes_from(queue))
+        };
+        if !asks.iter().any(|ask| served(ask, &queues)) {
+            return Ok(asks.iter().map(|_| None).collect());
+        }
+        let (mut transaction, now) = self.begin().await?;
+        let outcome = async {
+            let (mut leased, mut answers) = (Vec::new(), Vec::new());
+            for (index, ask) in asks.iter().enumerate() {
+                if !served(ask, &queues) {
+                    answers.push(None);
+                    continue;
+                }
+                let left = asks.len() - index;
+                let next = next_job(&mut transaction, &mut queues, ask, left, now).await?;
+                answers.push(next.as_ref().map(|_| leased.len()));
+                if let Some(mut job) = next {
+                    let attempt = job.attempt;
+                    job.lease(ask.worker.id.clone(), ask.holder.clone(), now, self.settings.lease)
+                        .map_err(|refusal| refused(&job, attempt, refusal))?;
+                    leased.push(job);
+                }
+            }
+            save_jobs(&mut transaction, &leased).await?;
+            Ok((leased, answers))
+        }
+        .await;
+        let change = match &outcome {
+            // Others may have passed over jobs that were locked here.
+            Ok(_) if queues.iter().any(Queue::holds_jobs) => Change::Work,
+            Ok((leased, _)) if !leased.is_empty() => Change::Job,
+            _ => Change::Nothing,
+        };
+        let (leased, answers) = self.finish(transaction, outcome, change).await?;
+        Ok(answers
+            .into_iter()
+            .map(|at| at.map(|at: usize| leased[at].clone()))
+            .collect())
+    }
+
+    /// Publishes bundles of several jobs and ends the jobs. With a `lock` that skips rows which somebody holds, those are
+    /// answered with none, as is what cannot share a transaction with the others.
+    async fn publish_all(
+        &self,
+        asks: &[PublishAsk],
+        lock: &str,
+    ) -> Result<Vec<Option<Result<Version>>>> {
+        let (mut transaction, now) = self.begin().await?;
+        let outcome = async {
+            let mut jobs = lock_jobs(&mut transaction, asks.iter().map(|ask| ask.job), lock).await?;
+            let mut answers: Vec<Option<Result<Version>>> = Vec::new();
+            let mut holding = Vec::new();
+            for ask in asks {
+                let Some(job) = jobs.remove(&ask.job) else {
+                    answers.push(None);
+                    continue;
+                };
+                let again = match job.version {
+                    Some(version) if job.attempt == ask.attempt => {
+                        let reference = format!("v{version}");
+                        let published =
+                            find_version(&mut transaction, &job.spec.object, &reference).await?;
+                        Some(published).filter(|it| it.bundle.manifest_digest == ask.bundle.manifest_digest)
+                    }
+                    _ => None,
+                };
+                answers.push(match (again, job.holds(ask.attempt)) {
+                    (Some(published), _) => Some(Ok(published)),
+                    (None, Err(refusal)) => Some(Err(refused(&job, ask.attempt, refusal))),
+                    (None, Ok(())) => {
+                        holding.push((answers.len(), job));
+                        None
+                    }
+                });
+            }
+            let objects = holding.iter().map(|(_, job)| &job.spec.object).collect();
+            let mut last = lock_objects(&mut transaction, objects, lock).await?;
+            let (mut versions, mut ended) = (Vec::new(), Vec::new());
+            for (index, mut job) in holding {
+                let Some(last) = last.get_mut(&job.spec.object) else {
+                    continue;
+                };
+                *last += 1;
+                let ask = &asks[index];
+                job.complete(ask.attempt, *last, now)
+                    .map_err(|refusal| refused(&job, ask.attempt, refusal))?;
+                versions.push((
+                    index,
+                    Version {
+                        object: job.spec.object.clone(),
+                        version: *last,
+                        bundle: ask.bundle.clone(),
+                        aliases: Vec::new(),
+                        created_at: now,
+                        job: job.id,
+                        retired: false,
+                        retired_at: None,
+                    },
+                ));
+                ended.push(job);
+            }
+            let (indices, mut versions): (Vec<usize>, Vec<Version>) = versions.into_iter().unzip();
+            if !versions.is_empty() {
+                let newest: BTreeMap<&ObjectName, u32> =
+                    versions.iter().map(|it| (&it.object, it.version)).collect();
+                advance_objects(&mut transaction, &newest).await?;
+                insert_versions(&mut transaction, &versions).await?;
+                let latest = newest.iter().map(|(object, version)| (*object, *version));
+                point_aliases(&mut transaction, LATEST, latest).await?;
+                save_jobs(&mut transaction, &ended).await?;
+                for (job, version) in ended.iter().zip(&versions) {
+                    announce(&mut transaction, job, Some(&version.bundle), now).await?;
+                }
+                for version in &mut versions {
+                    if last.get(&version.object) == Some(&version.version) {
+                        version.aliases.push(LATEST.to_owned());
+                    }
+                }
+            }
+            for (index, version) in indices.into_iter().zip(versions) {
+                answers[index] = Some(Ok(version));
+            }
+            Ok(answers)
+        }
+        .await;
+        self.finish(transaction, outcome, Change::Work).await
     }
 
     /// Takes back leases that ran out, at most [`REAP_BATCH`], and forgets workers that are long gone.
@@ -712,9 +875,9 @@ impl SqlStore {
             let mut jobs = jobs_from(&rows)?;
             for job in &mut jobs {
                 job.expire(now);
-                save_job(&mut transaction, job).await?;
                 announce(&mut transaction, job, None, now).await?;
             }
+            save_jobs(&mut transaction, &jobs).await?;
             sqlx::query("delete from workers where last_seen_at < $1")
                 .bind(to_db(now - seconds(WORKER_KEPT_SECS)))
                 .execute(&mut *transaction)
@@ -728,48 +891,237 @@ impl SqlStore {
         };
         self.finish(transaction, outcome, change).await
     }
+}
 
-    /// Leases the first job of a collection that nobody else is about to take.
-    async fn claim(
-        &self,
-        connection: &mut Connection,
-        collection: &CollectionId,
-        worker: &WorkerId,
-        holder: Option<&str>,
-        now: DateTime<Utc>,
-    ) -> Result<Option<Job>> {
-        if !has_room(connection, collection).await? {
-            return Ok(None);
-        }
-        let row = sqlx::query(sql(format!(
-            "select {JOB} from jobs where collection = $1 and state = 'queued' and not_before <= $2 \
-             order by priority desc, submitted_at, id limit 1 {LOCK_FREE_ROWS}"
-        )))
-        .bind(collection.as_str())
-        .bind(to_db(now))
-        .fetch_optional(&mut *connection)
-        .await?;
-        let Some(row) = row else { return Ok(None) };
-        let mut job = job_from(&row)?;
-        let attempt = job.attempt;
-        let holder = holder.map(str::to_owned);
-        job.lease(worker.clone(), holder, now, self.settings.lease)
-            .map_err(|refusal| refused(&job, attempt, refusal))?;
-        save_job(connection, &job).await?;
-        Ok(Some(job))
+/// A worker that asks for a job.
+#[derive(Debug)]
+struct LeaseAsk {
+    worker: WorkerInfo,
+    holder: Option<String>,
+    within: Option<BTreeSet<CollectionId>>,
+}
+
+impl LeaseAsk {
+    fn takes_from(&self, queue: &Queue) -> bool {
+        let name = &queue.collection.name;
+        self.within.as_ref().is_none_or(|within| within.contains(name))
     }
 }
 
-/// Whether the collection may run one more job. Where it has a limit its row is locked, so that two claims do not both
+/// A worker that ends a job with a bundle.
+#[derive(Clone, Debug)]
+struct PublishAsk {
+    job: JobId,
+    attempt: Attempt,
+    bundle: NewVersion,
+}
+
+/// A collection with something to lease.
+#[derive(Debug)]
+struct Queue {
+    collection: Collection,
+    running: u64,
+    served_at: Option<DateTime<Utc>>,
+    /// Priority, age and id of its next job.
+    head: (i64, DateTime<Utc>, JobId),
+    /// Its next jobs, once their rows are locked.
+    locked: Option<VecDeque<Job>>,
+}
+
+impl Queue {
+    /// Which of two is served first: priority, then the fewest running jobs for the weight, then the one served longest
+    /// ago, then age.
+    fn before(&self, other: &Self) -> Ordering {
+        let share = |queue: &Self| queue.running as f64 / queue.collection.weight;
+        let age = |queue: &Self| (queue.head.1, queue.head.2);
+        other
+            .head
+            .0
+            .cmp(&self.head.0)
+            .then_with(|| share(self).total_cmp(&share(other)))
+            .then_with(|| self.served_at.cmp(&other.served_at))
+            .then_with(|| age(self).cmp(&age(other)))
+    }
+
+    fn take_head(&mut self) {
+        if let Some(job) = self.locked.as_ref().and_then(VecDeque::front) {
+            self.head = (i64::from(job.spec.priority), job.submitted_at, job.id);
+        }
+    }
+
+    fn holds_jobs(&self) -> bool {
+        self.locked.as_ref().is_some_and(|jobs| !jobs.is_empty())
+    }
+}
+
+/// Collections that may run one more of their queued jobs.
+async fn waiting_queues(reader: &mut Connection, now: DateTime<Utc>) -> Result<Vec<Queue>> {
+    let rows = sqlx::query(
+        "select c.*, coalesce(r.running, 0) as running, j.priority, j.submitted_at, j.id, \
+         (select max(s.started_at) from jobs s where s.collection = c.name and s.started_at is not null) as served_at \
+         from collections c \
+         left join (select collection, count(*) as running from jobs where state = 'leased' group by collection) r \
+         on r.collection = c.name \
+         join jobs j on j.id = (select q.id from jobs q where q.collection = c.name and q.state = 'queued' \
+         and q.not_before <= $1 order by q.priority desc, q.submitted_at, q.id limit 1) \
+         where not c.paused and (c.max_running = 0 or coalesce(r.running, 0) < c.max_running)",
+    )
+    .bind(to_db(now))
+    .fetch_all(reader)
+    .await?;
+    rows.iter()
+        .map(|row| {
+            Ok(Queue {
+                collection: collection_from(row)?,
+                running: count(row.try_get("running")?),
+                served_at: optional_time(row, "served_at")?,
+                head: (
+                    row.try_get("priority")?,
+                    time(row, "submitted_at")?,
+                    from_key(row.try_get("id")?)?,
+                ),
+                locked: None,
+            })
+        })
+        .collect()
+}
+
+/// The next job for a worker, its row locked; `at_most` jobs are wanted in this transaction from now on. A queue from
+/// which nothing more can be taken is dropped.
+async fn next_job(
+    connection: &mut Connection,
+    queues: &mut Vec<Queue>,
+    ask: &LeaseAsk,
+    at_most: usize,
+    now: DateTime<Utc>,
+) -> Result<Option<Job>> {
+    loop {
+        let first = (0..queues.len())
+            .filter(|&at| ask.takes_from(&queues[at]))
+            .min_by(|&a, &b| queues[a].before(&queues[b]));
+        let Some(at) = first else { return Ok(None) };
+        let queue = &mut queues[at];
+        let Some(jobs) = &mut queue.locked else {
+            let name = &queue.collection.name;
+            let room = room(connection, name).await?.min(at_most as u64);
+            queue.locked = Some(lock_queued(connection, name, room, now).await?);
+            queue.take_head();
+            continue;
+        };
+        let Some(job) = jobs.pop_front() else {
+            queues.remove(at);
+            continue;
+        };
+        queue.running += 1;
+        queue.served_at = Some(now);
+        queue.take_head();
+        return Ok(Some(job));
+    }
+}
+
+/// The first jobs of a collection that nobody else is about to take.
+async fn lock_queued(
+    connection: &mut Connection,
+    collection: &CollectionId,
+    at_most: u64,
+    now: DateTime<Utc>,
+) -> Result<VecDeque<Job>> {
+    let rows = sqlx::query(sql(format!(
+        "select {JOB} from jobs where collection = $1 and state = 'queued' and not_before <= $2 \
+         order by priority desc, submitted_at, id limit $3 {LOCK_FREE_ROWS}"
+    )))
+    .bind(collection.as_str())
+    .bind(to_db(now))
+    .bind(at_most as i64)
+    .fetch_all(connection)
+    .await?;
+    Ok(jobs_from(&rows)?.into())
+}
+
+/// Jobs by id, their rows locked until the transaction ends.
+async fn lock_jobs(
+    connection: &mut Connection,
+    jobs: impl IntoIterator<Item = JobId>,
+    lock: &str,
+) -> Result<BTreeMap<JobId, Job>> {
+    let mut select = QueryBuilder::<Db>::new(format!("select {JOB} from jobs where id in ("));
+    let mut ids = select.separated(", ");
+    for job in jobs {
+        ids.push_bind(key(job));
+    }
+    select.push(") order by id ").push(lock);
+    let rows = select.build().fetch_all(connection).await?;
+    let jobs = jobs_from(&rows)?;
+    Ok(jobs.into_iter().map(|job| (job.id, job)).collect())
+}
+
+/// The newest version numbers of objects, their rows made where they are missing and locked until the transaction ends.
+async fn lock_objects(
+    connection: &mut Connection,
+    objects: BTreeSet<&ObjectName>,
+    lock: &str,
+) -> Result<BTreeMap<ObjectName, u32>> {
+    if objects.is_empty() {
+        return Ok(BTreeMap::new());
+    }
+    let mut insert =
+        QueryBuilder::<Db>::new("insert into objects (collection, object, last_version) ");
+    insert.push_values(&objects, |mut row, object| {
+        row.push_bind(object.collection.as_str())
+            .push_bind(object.object.as_str())
+            .push("0");
+    });
+    insert
+        .push(" on conflict (collection, object) do nothing")
+        .build()
+        .execute(&mut *connection)
+        .await?;
+    let mut select =
+        QueryBuilder::<Db>::new("select * from objects where (collection, object) in (");
+    select.push_values(&objects, |mut row, object| {
+        row.push_bind(object.collection.as_str())
+            .push_bind(object.object.as_str());
+    });
+    select.push(") order by collection, object ").push(lock);
+    let rows = select.build().fetch_all(connection).await?;
+    rows.iter()
+        .map(|row| Ok((object_name(row)?, small(row.try_get("last_version")?)?)))
+        .collect()
+}
+
+/// Writes the newest version numbers of objects whose rows are locked.
+async fn advance_objects(
+    connection: &mut Connection,
+    newest: &BTreeMap<&ObjectName, u32>,
+) -> Result<()> {
+    let mut update =
+        QueryBuilder::<Db>::new("update objects set last_version = v.column3 from (");
+    update.push_values(newest, |mut row, (object, version)| {
+        row.push_bind(object.collection.as_str())
+            .push_bind(object.object.as_str())
+            .push_bind(i64::from(*version));
+    });
+    update
+        .push(") v where objects.collection = v.column1 and objects.object = v.column2")
+        .build()
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
+/// How many more jobs the collection may run. Where it has a limit its row is locked, so that two claims do not both
 /// take the last place; others are not held up.
-async fn has_room(connection: &mut Connection, collection: &CollectionId) -> Result<bool> {
+async fn room(connection: &mut Connection, collection: &CollectionId) -> Result<u64> {
     let row = sqlx::query("select * from collections where name = $1")
         .bind(collection.as_str())
         .fetch_one(&mut *connection)
         .await?;
     let settings = collection_from(&row)?;
-    if settings.paused || settings.max_running == 0 {
-        return Ok(!settings.paused);
+    if settings.paused {
+        return Ok(0);
+    }
+    if settings.max_running == 0 {
+        return Ok(u64::MAX);
     }
     let row = sqlx::query(sql(format!(
         "select * from collections where name = $1 {LOCK}"
@@ -783,8 +1135,107 @@ async fn has_room(connection: &mut Connection, collection: &CollectionId) -> Res
             .bind(collection.as_str())
             .fetch_one(connection)
             .await?;
-    Ok(!settings.paused
-        && (settings.max_running == 0 || count(running) < u64::from(settings.max_running)))
+    Ok(match (settings.paused, settings.max_running) {
+        (true, _) => 0,
+        (false, 0) => u64::MAX,
+        (false, limit) => u64::from(limit).saturating_sub(count(running)),
+    })
+}
+
+/// A collection and how many jobs wait in it.
+#[derive(Debug)]
+struct QueueCounts {
+    collection: Collection,
+    running: u64,
+    by_priority: BTreeMap<i64, u64>,
+}
+
+async fn all_queues(reader: &mut Connection) -> Result<BTreeMap<CollectionId, QueueCounts>> {
+    let rows = sqlx::query(
+        "select c.*, (select count(*) from jobs j where j.collection = c.name and j.state = 'leased') as running \
+         from collections c",
+    )
+    .fetch_all(&mut *reader)
+    .await?;
+    let mut queues = BTreeMap::new();
+    for row in rows {
+        let collection = collection_from(&row)?;
+        let counts = QueueCounts {
+            running: count(row.try_get("running")?),
+            by_priority: BTreeMap::new(),
+            collection,
+        };
+        queues.insert(counts.collection.name.clone(), counts);
+    }
+    let rows = sqlx::query(
+        "select collection, priority, count(*) as jobs from jobs where state = 'queued' group by collection, priority",
+    )
+    .fetch_all(reader)
+    .await?;
+    for row in rows {
+        let name: CollectionId = parse(row.try_get("collection")?)?;
+        if let Some(queue) = queues.get_mut(&name) {
+            let jobs = count(row.try_get("jobs")?);
+            queue.by_priority.insert(row.try_get("priority")?, jobs);
+        }
+    }
+    Ok(queues)
+}
+
+/// Where a job stands among the queued ones.
+fn queue_place(job: &Job) -> (CollectionId, i32, DateTime<Utc>, JobId) {
+    (
+        job.spec.object.collection.clone(),
+        job.spec.priority,
+        job.submitted_at,
+        job.id,
+    )
+}
+
+/// For each of some queued jobs, sorted by [`queue_place`], how many of the same collection and priority are older. Each
+/// stretch of the queue between two of them is counted once.
+async fn older_equals(reader: &mut Connection, jobs: &[&Job]) -> Result<BTreeMap<JobId, u64>> {
+    let mut between = BTreeMap::new();
+    let before = std::iter::once(None).chain(jobs.iter().copied().map(Some));
+    let stretches: Vec<_> = before.zip(jobs.iter().copied()).collect();
+    let same_queue = |before: Option<&Job>, job: &Job| {
+        let queue = |job: &Job| (job.spec.object.collection.clone(), job.spec.priority);
+        before.is_some_and(|before| queue(before) == queue(job))
+    };
+    for chunk in stretches.chunks(CHUNK) {
+        let mut select = QueryBuilder::<Db>::new(
+            "select v.column1 as id, (select count(*) from jobs j where j.state = 'queued' and j.collection = v.column2 \
+             and j.priority = v.column3 and (j.submitted_at, j.id) >= (v.column4, v.column5) \
+             and (j.submitted_at, j.id) < (v.column6, v.column1)) as jobs from (",
+        );
+        select.push_values(chunk, |mut row, (before, job)| {
+            let from = before.filter(|_| same_queue(*before, job));
+            row.push_bind(key(job.id))
+                .push_bind(job.spec.object.collection.as_str())
+                .push_bind(i64::from(job.spec.priority))
+                .push_bind(to_db(from.map_or(DateTime::UNIX_EPOCH, |job| job.submitted_at)))
+                .push_bind(key(from.map_or(uuid::Uuid::nil().into(), |job| job.id)))
+                .push_bind(to_db(job.submitted_at));
+        });
+        for row in select
+            .push(") v")
+            .build()
+            .fetch_all(&mut *reader)
+            .await?
+        {
+            between.insert(from_key(row.try_get("id")?)?, count(row.try_get("jobs")?));
+        }
+    }
+    let mut older = BTreeMap::new();
+    for (before, job) in stretches {
+        let so_far = before
+            .filter(|_| same_queue(before, job))
+            .and_then(|before: &Job| older.get(&before.id))
+            .copied()
+            .unwrap_or(0);
+        older.insert(job.id, so_far + between.get(&job.id).copied().unwrap_or(0));
+    }
+    Ok(older)
 }
 
 fn select_jobs(collection: Option<&CollectionId>, state: JobState) -> QueryBuilder<Db> {
@@ -800,6 +1251,15 @@ fn select_jobs(collection: Option<&CollectionId>, state: JobState) -> QueryBuild
     query
 }
 
+fn worker_from(row: &DbRow) -> Result<WorkerInfo> {
+    Ok(WorkerInfo {
+        id: parse(row.try_get("id")?)?,
+        hostname: row.try_get("hostname")?,
+        version: row.try_get("version")?,
+        device: row.try_get("device")?,
+    })
+}
+
 async fn list_workers(connection: &mut Connection, now: DateTime<Utc>) -> Result<Vec<Worker>> {
     let rows = sqlx::query(
         "select w.*, (select j.id from jobs j where j.worker = w.id and j.state = 'leased' \
@@ -811,12 +1271,7 @@ async fn list_workers(connection: &mut Connection, now: DateTime<Utc>) -> Result
     rows.iter()
         .map(|row| {
             Ok(Worker {
-                info: WorkerInfo {
-                    id: parse(row.try_get("id")?)?,
-                    hostname: row.try_get("hostname")?,
-                    version: row.try_get("version")?,
-                    device: row.try_get("device")?,
-                },
+                info: worker_from(row)?,
                 last_seen_at: time(row, "last_seen_at")?,
                 job: row
                     .try_get::<Option<_>, _>("job_id")?
@@ -964,60 +1419,66 @@ impl Store for SqlStore {
         Ok(JobPage { jobs, next })
     }
 
-    async fn waiting(&self, job: &Job) -> Result<Waiting> {
-        if job.state != JobState::Queued {
-            return Ok(Waiting {
-                position: 0,
-                reason: String::new(),
-            });
+    async fn all_waiting(&self, jobs: &[Job]) -> Result<Vec<Waiting>> {
+        let mut queued: Vec<&Job> = jobs
+            .iter()
+            .filter(|job| job.state == JobState::Queued)
+            .collect();
+        let nothing = || Waiting {
+            position: 0,
+            reason: String::new(),
+        };
+        if queued.is_empty() {
+            return Ok(jobs.iter().map(|_| nothing()).collect());
         }
-        let name = &job.spec.object.collection;
         let mut reader = self.backend.reader().acquire().await?;
         let now = Backend::now(&mut reader).await?;
-        let row = sqlx::query(
-            "select c.*, (select count(*) from jobs j where j.collection = c.name and j.state = 'leased') as running, \
-             (select count(*) from jobs j where j.collection = c.name and j.state = 'queued' and (j.priority > $2 \
-             or (j.priority = $2 and (j.submitted_at, j.id) < ($3, $4)))) as ahead, \
-             (select count(*) from workers w where not w.draining and w.last_seen_at > $5) as workers \
-             from collections c where c.name = $1",
+        let workers: i64 = sqlx::query_scalar(
+            "select count(*) from workers where not draining and last_seen_at > $1",
         )
-        .bind(name.as_str())
-        .bind(i64::from(job.spec.priority))
-        .bind(to_db(job.submitted_at))
-        .bind(key(job.id))
         .bind(to_db(now - self.settings.lease))
         .fetch_one(&mut *reader)
         .await?;
-        let rivals = sqlx::query(
-            "select c.weight, q.higher, q.equal from collections c join (select collection, \
-             sum(case when priority > $2 then 1 else 0 end) as higher, \
-             sum(case when priority = $2 then 1 else 0 end) as equal \
-             from jobs where state = 'queued' group by collection) q on q.collection = c.name \
-             where c.name <> $1 and not c.paused",
-        )
-        .bind(name.as_str())
-        .bind(i64::from(job.spec.priority))
-        .fetch_all(&mut *reader)
-        .await?;
-        let others = rivals
-            .iter()
-            .map(|row| {
-                Ok(Rival {
-                    weight: row.try_get("weight")?,
-                    higher: count(row.try_get("higher")?),
-                    equal: count(row.try_get("equal")?),
-                })
+        let queues = all_queues(&mut reader).await?;
+        queued.sort_by_key(|job| queue_place(job));
+        let older = older_equals(&mut reader, &queued).await?;
+        jobs.iter()
+            .map(|job| {
+                let Some(older) = older.get(&job.id) else {
+                    return Ok(nothing());
+                };
+                let name = &job.spec.object.collection;
+                let own = queues
+                    .get(name)
+                    .ok_or_else(|| internal(format!("a job's collection {name} is missing")))?;
+                let higher = |queue: &QueueCounts| -> u64 {
+                    let from = i64::from(job.spec.priority) + 1;
+                    queue.by_priority.range(from..).map(|(_, jobs)| jobs).sum()
+                };
+                let others = queues
+                    .values()
+                    .filter(|other| other.collection.name != *name && !other.collection.paused)
+                    .map(|other| Rival {
+                        weight: other.collection.weight,
+                        higher: higher(other),
+                        equal: other
+                            .by_priority
+                            .get(&i64::from(job.spec.priority))
+                            .copied()
+                            .unwrap_or(0),
+                    })
+                    .collect();
+                let around = Surroundings {
+                    collection: own.collection.clone(),
+                    running: own.running,
+                    ahead: higher(own) + older,
+                    others,
+                    workers: count(workers),
+                    now,
+                };
+                Ok(describe(job, &around))
             })
-            .collect::<Result<_>>()?;
-        let around = Surroundings {
-            collection: collection_from(&row)?,
-            running: count(row.try_get("running")?),
-            ahead: count(row.try_get("ahead")?),
-            others,
-            workers: count(row.try_get("workers")?),
-            now,
-        };
-        Ok(describe(job, &around))
+            .collect()
     }
 
     async fn cancel(&self, job: JobId) -> Result<Job> {
@@ -1107,33 +1568,19 @@ impl Store for SqlStore {
         holder: Option<&str>,
         within: Option<&BTreeSet<CollectionId>>,
     ) -> Result<Option<Job>> {
-        if self.touch_worker(worker).await? {
-            return Ok(None);
-        }
-        let mut collections = self.eligible().await?;
-        collections.retain(|name| within.is_none_or(|within| within.contains(name)));
-        if collections.is_empty() {
-            return Ok(None);
-        }
-        let (mut transaction, now) = self.begin().await?;
-        let outcome = async {
-            for collection in &collections {
-                let claimed = self
-                    .claim(&mut transaction, collection, &worker.id, holder, now)
-                    .await?;
-                if claimed.is_some() {
-                    return Ok(claimed);
-                }
-            }
-            Ok(None)
-        }
-        .await;
-        let change = if matches!(outcome, Ok(Some(_))) {
-            Change::Job
-        } else {
-            Change::Nothing
+        let ask = LeaseAsk {
+            worker: worker.clone(),
+            holder: holder.map(str::to_owned),
+            within: within.cloned(),
         };
-        self.finish(transaction, outcome, change).await
+        let run = |asks: Vec<LeaseAsk>| async move {
+            match self.lease_all(&asks).await {
+                Ok(jobs) => jobs.into_iter().map(Ok).collect(),
+                Err(error) => asks.iter().map(|_| Err(shared(&error))).collect(),
+            }
+        };
+        let leased = self.leases.join(ask, run).await;
+        leased.unwrap_or_else(|| Err(cut_off()))
     }
 
     async fn heartbeat(
@@ -1193,50 +1640,35 @@ impl Store for SqlStore {
         bundle: NewVersion,
     ) -> Result<Version> {
         check::bundle(&bundle)?;
-        let (mut transaction, now) = self.begin().await?;
-        let outcome = async {
-        let mut job = lock_job(&mut transaction, job).await?;
-        let object = job.spec.object.clone();
-        if let (Some(version), true) = (job.version, job.attempt == attempt) {
-            let published = find_version(&mut transaction, &object, &format!("v{version}")).await?;
-            if published.bundle.manifest_digest == bundle.manifest_digest {
-                return Ok(published);
+        let ask = PublishAsk {
+            job,
+            attempt,
+            bundle,
+        };
+        let run = |asks: Vec<PublishAsk>| async move {
+            match self.publish_all(&asks, LOCK_FREE_ROWS).await {
+                Ok(answers) => answers,
+                Err(error @ StoreError::Unavailable { .. }) => {
+                    asks.iter().map(|_| Some(Err(shared(&error)))).collect()
+                }
+                // Something of one of them was refused: each is to hear its own.
+                Err(_) => asks.iter().map(|_| None).collect(),
+            }
+        };
+        match self.publishes.join(ask.clone(), run).await {
+            None => Err(cut_off()),
+            Some(Some(published)) => published,
+            // Not with the others: it waits for what they passed over.
+            Some(None) => {
+                let mut alone = self.publish_all(&[ask], LOCK).await?;
+                alone.pop().flatten().unwrap_or_else(|| {
+                    Err(StoreError::NotFound {
+                        kind: "job",
+                        name: job.to_string(),
+                    })
+                })
             }
         }
-        job.holds(attempt)
-            .map_err(|refusal| refused(&job, attempt, refusal))?;
-
-        let version: i64 = sqlx::query_scalar(
-            "insert into objects (collection, object, last_version) values ($1, $2, 1) \
-             on conflict (collection, object) do update set last_version = objects.last_version + 1 \
-             returning last_version",
-        )
-        .bind(object.collection.as_str())
-        .bind(object.object.as_str())
-        .fetch_one(&mut *transaction)
-        .await?;
-        let version = small(version)?;
-        let new = Version {
-            object: object.clone(),
-            version,
-            bundle,
-            aliases: Vec::new(),
-            created_at: now,
-            job: job.id,
-            retired: false,
-            retired_at: None,
-        };
-        insert_version(&mut transaction, &new).await?;
-        point_alias(&mut transaction, &object, LATEST, version).await?;
-        job.complete(attempt, version, now)
-            .map_err(|refusal| refused(&job, attempt, refusal))?;
-        save_job(&mut transaction, &job).await?;
-        announce(&mut transaction, &job, Some(&new.bundle), now).await?;
-        let published = find_version(&mut transaction, &object, &format!("v{version}")).await?;
-        Ok(published)
-        }
-        .await;
-        self.finish(transaction, outcome, Change::Work).await
     }
 
     async fn fail(
@@ -1434,7 +1866,7 @@ impl Store for SqlStore {
                         continue;
                     }
                     Err(StoreError::NotFound { .. }) => {
-                        insert_version(&mut transaction, version).await?;
+                        insert_versions(&mut transaction, std::slice::from_ref(version)).await?;
                         adopted.added.push(version.version);
                         true
                     }

@@ -388,7 +388,16 @@ pub trait Store: Tokens + Webhooks + Send + Sync + std::fmt::Debug + 'static {
     async fn list(&self, filter: &JobFilter, after: Option<JobId>, limit: u32) -> Result<JobPage>;
 
     /// How long a queued job will wait and for what.
-    async fn waiting(&self, job: &Job) -> Result<Waiting>;
+    async fn waiting(&self, job: &Job) -> Result<Waiting> {
+        let mut results = self.all_waiting(std::slice::from_ref(job)).await?;
+        results.pop().ok_or_else(|| StoreError::Internal {
+            message: "no result for a job".to_owned(),
+            source: None,
+        })
+    }
+
+    /// The same of several jobs, in their order; each part of the queue is counted once.
+    async fn all_waiting(&self, jobs: &[Job]) -> Result<Vec<Waiting>>;
 
     /// Stops a job: at once while queued, with its worker's next heartbeat while leased.
     async fn cancel(&self, job: JobId) -> Result<Job>;

@@ -49,20 +49,27 @@ pub struct Postgres {
     server: Mutex<Option<Child>>,
     databases: AtomicU32,
     tls: bool,
+    durable: bool,
 }
 
 impl Postgres {
-    /// Makes a new cluster and starts it. Takes about a second.
+    /// Makes a new cluster and starts it. Takes about a second. What it commits outlives a crash of its processes, not one
+    /// of the machine: tests do not wait for the disk.
     pub fn start() -> Result<Self> {
-        Self::start_with(None)
+        Self::make(None, false)
     }
 
     /// The same, for connections over TLS alone: with this certificate and its key, in PEM.
     pub fn start_with_tls(certificate: &str, key: &str) -> Result<Self> {
-        Self::start_with(Some((certificate, key)))
+        Self::make(Some((certificate, key)), false)
     }
 
-    fn start_with(tls: Option<(&str, &str)>) -> Result<Self> {
+    /// The same with Postgres's own settings for durability, for measuring what it reaches.
+    pub fn start_durable() -> Result<Self> {
+        Self::make(None, true)
+    }
+
+    fn make(tls: Option<(&str, &str)>, durable: bool) -> Result<Self> {
         let bin = find_binaries()?;
         let dir = tempfile::Builder::new().prefix("ign-pg-").tempdir()?.keep();
         let cluster = Self {
@@ -72,6 +79,7 @@ impl Postgres {
             server: Mutex::new(None),
             databases: AtomicU32::new(0),
             tls: tls.is_some(),
+            durable,
         };
         if is_root()? {
             run(Command::new("chown").arg("postgres").arg(&cluster.dir))
@@ -193,16 +201,13 @@ impl Postgres {
             .arg("-k")
             .arg(&self.dir)
             .args(["-h", "127.0.0.1", "-p", &self.port.to_string()])
-            .args([
-                "-c",
-                "fsync=off",
-                "-c",
-                "full_page_writes=off",
-                "-c",
-                "max_connections=300",
-                "-c",
-                if self.tls { "ssl=on" } else { "ssl=off" },
-            ])
+            .args(["-c", "max_connections=300"])
+            .args(["-c", if self.tls { "ssl=on" } else { "ssl=off" }])
+            .args(if self.durable {
+                &[][..]
+            } else {
+                &["-c", "fsync=off", "-c", "full_page_writes=off"]
+            })
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(Stdio::null())
