@@ -11,7 +11,9 @@ use futures::stream::{self, StreamExt as _, TryStreamExt as _};
 use ign_proto::v1::jobs_server::Jobs;
 use ign_proto::{Cause, CollectionId, Digest, JobId, Kind, Scope, v1};
 use ign_queue::store::MAX_PAGE;
-use ign_queue::{Job, JobFilter, JobPage, JobState, Status as Screen, StoreError, Submit, Worker};
+use ign_queue::{
+    Job, JobFilter, JobPage, JobState, Status as Screen, StoreError, Submit, Waiting, Worker,
+};
 use ign_registry::RegistryError;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -46,9 +48,26 @@ pub(crate) struct JobsApi(pub(crate) Arc<App>);
 impl App {
     /// The job as the wire has it, with its bundle or its place in the queue.
     async fn full_job(&self, job: &Job) -> Result<v1::Job, Refused> {
+        let waiting = self.store.waiting(job).await?;
+        self.with_bundle(job, waiting).await
+    }
+
+    async fn full_jobs(&self, jobs: &[Job]) -> Result<Vec<v1::Job>, Refused> {
+        let waiting = self.store.all_waiting(jobs).await?;
+        let lookups: Vec<_> = jobs
+            .iter()
+            .zip(waiting)
+            .map(|(job, waiting)| self.with_bundle(job, waiting))
+            .collect();
+        stream::iter(lookups)
+            .buffered(LOOKUPS_IN_FLIGHT)
+            .try_collect()
+            .await
+    }
+
+    async fn with_bundle(&self, job: &Job, waiting: Waiting) -> Result<v1::Job, Refused> {
         let mut wire = to_job(job);
         if job.state == JobState::Queued {
-            let waiting = self.store.waiting(job).await?;
             wire.queue_position = waiting.position;
             wire.waiting_for = match self.room.check(Write::Work) {
                 Ok(()) => waiting.reason,
@@ -67,14 +86,6 @@ impl App {
             }
         }
         Ok(wire)
-    }
-
-    async fn full_jobs(&self, jobs: &[Job]) -> Result<Vec<v1::Job>, Refused> {
-        let lookups: Vec<_> = jobs.iter().map(|job| self.full_job(job)).collect();
-        stream::iter(lookups)
-            .buffered(LOOKUPS_IN_FLIGHT)
-            .try_collect()
-            .await
     }
 
     /// By id, or by a prefix of it. A job of a collection where the caller lacks the scope does not exist for it.

@@ -7,6 +7,7 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use tokio::sync::Semaphore;
 use tokio::sync::oneshot::{self, error::TryRecvError};
 
 /// Calls in one transaction: few enough that the first does not wait long for the last.
@@ -16,19 +17,18 @@ const MAX_CALLS: usize = 32;
 #[derive(Debug)]
 pub(crate) struct Group<Ask, Answer> {
     waiting: Mutex<VecDeque<(Ask, oneshot::Sender<Answer>)>>,
-    turn: tokio::sync::Mutex<()>,
-}
-
-impl<Ask, Answer> Default for Group<Ask, Answer> {
-    fn default() -> Self {
-        Self {
-            waiting: Mutex::default(),
-            turn: tokio::sync::Mutex::default(),
-        }
-    }
+    turns: Semaphore,
 }
 
 impl<Ask, Answer> Group<Ask, Answer> {
+    /// So many transactions run at a time.
+    pub(crate) fn new(at_once: usize) -> Self {
+        Self {
+            waiting: Mutex::default(),
+            turns: Semaphore::new(at_once),
+        }
+    }
+
     /// The answer to `ask`, from `run` called here or by another caller; it gives one answer for each. None when whoever
     /// ran it was cut off in the middle.
     pub(crate) async fn join<Run, Ran>(&self, ask: Ask, run: Run) -> Option<Answer>
@@ -41,16 +41,19 @@ impl<Ask, Answer> Group<Ask, Answer> {
         let _turn = tokio::select! {
             biased;
             answered = &mut answer => return answered.ok(),
-            turn = self.turn.lock() => turn,
+            turn = self.turns.acquire() => turn,
         };
         loop {
             match answer.try_recv() {
                 Ok(answered) => return Some(answered),
                 Err(TryRecvError::Closed) => return None,
-                // Ours still waits, perhaps behind a full group.
                 Err(TryRecvError::Empty) => {}
             }
+            // Ours waits, perhaps behind a full group, or another caller has it.
             let (asks, senders): (Vec<_>, Vec<_>) = self.next().into_iter().unzip();
+            if asks.is_empty() {
+                return answer.await.ok();
+            }
             for (sender, answered) in senders.into_iter().zip(run(asks).await) {
                 // A caller that left does not want it.
                 sender.send(answered).ok();
@@ -79,7 +82,7 @@ mod tests {
 
     #[tokio::test]
     async fn each_call_gets_its_own_answer_and_calls_that_wait_share_a_run() {
-        let (group, runs) = (Arc::new(Group::default()), Arc::new(AtomicUsize::new(0)));
+        let (group, runs) = (Arc::new(Group::new(2)), Arc::new(AtomicUsize::new(0)));
         let calls = (0..100_usize).map(|number| {
             let (group, runs) = (group.clone(), runs.clone());
             tokio::spawn(async move {
@@ -98,12 +101,12 @@ mod tests {
             call.await.unwrap();
         }
         let runs = runs.load(Ordering::Relaxed);
-        assert!((4..=20).contains(&runs), "{runs} runs for 100 calls");
+        assert!((4..=40).contains(&runs), "{runs} runs for 100 calls");
     }
 
     #[tokio::test]
     async fn a_caller_that_leaves_in_the_middle_answers_nobody_and_blocks_nobody() {
-        let group = Arc::new(Group::<u8, u8>::default());
+        let group = Arc::new(Group::<u8, u8>::new(1));
         let leaves = tokio::spawn({
             let group = group.clone();
             async move { group.join(1, |_| std::future::pending()).await }

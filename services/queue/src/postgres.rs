@@ -51,6 +51,9 @@ const LOCK: &str = "for no key update";
 const LOCK_FREE_ROWS: &str = "for no key update skip locked";
 const ALIAS_LIST: &str = "string_agg(a.alias, ',')";
 
+/// Transactions of one kind at a time: one waits for the disk while another reads.
+const GROUPS_AT_ONCE: usize = 3;
+
 /// The pool, and the tasks that pass changes on; they end with the last store.
 #[derive(Debug)]
 pub(super) struct Backend {

@@ -19,8 +19,8 @@ use sqlx::types::Json;
 use sqlx::{AssertSqlSafe, QueryBuilder, Row, Transaction};
 
 use super::{
-    ALIAS_LIST, Backend, Connection, Db, DbTime, LOCK, LOCK_FREE_ROWS, from_db, from_key, key,
-    push_label, to_db,
+    ALIAS_LIST, Backend, Connection, Db, DbTime, GROUPS_AT_ONCE, LOCK, LOCK_FREE_ROWS, from_db,
+    from_key, key, push_label, to_db,
 };
 use crate::changes::{Change, Changes, Signal};
 use crate::check;
@@ -530,8 +530,8 @@ impl SqlStore {
             backend,
             signal,
             settings,
-            leases: Group::default(),
-            publishes: Group::default(),
+            leases: Group::new(GROUPS_AT_ONCE),
+            publishes: Group::new(GROUPS_AT_ONCE),
         }
     }
 
@@ -956,34 +956,47 @@ impl Queue {
 
 /// Collections that may run one more of their queued jobs.
 async fn waiting_queues(reader: &mut Connection, now: DateTime<Utc>) -> Result<Vec<Queue>> {
-    let rows = sqlx::query(
-        "select c.*, coalesce(r.running, 0) as running, j.priority, j.submitted_at, j.id, \
+    // Three looks at the top of one index: a join would be planned as a read of the whole table.
+    let head = |column: &str| {
+        format!(
+            "(select q.{column} from jobs q where q.collection = c.name and q.state = 'queued' and q.not_before <= $1 \
+             order by q.priority desc, q.submitted_at, q.id limit 1) as {column}"
+        )
+    };
+    let rows = sqlx::query(sql(format!(
+        "select c.*, {}, {}, {}, \
+         (select count(*) from jobs r where r.collection = c.name and r.state = 'leased') as running, \
          (select max(s.started_at) from jobs s where s.collection = c.name and s.started_at is not null) as served_at \
-         from collections c \
-         left join (select collection, count(*) as running from jobs where state = 'leased' group by collection) r \
-         on r.collection = c.name \
-         join jobs j on j.id = (select q.id from jobs q where q.collection = c.name and q.state = 'queued' \
-         and q.not_before <= $1 order by q.priority desc, q.submitted_at, q.id limit 1) \
-         where not c.paused and (c.max_running = 0 or coalesce(r.running, 0) < c.max_running)",
-    )
+         from collections c where not c.paused",
+        head("priority"),
+        head("submitted_at"),
+        head("id"),
+    )))
     .bind(to_db(now))
     .fetch_all(reader)
     .await?;
-    rows.iter()
-        .map(|row| {
-            Ok(Queue {
-                collection: collection_from(row)?,
-                running: count(row.try_get("running")?),
-                served_at: optional_time(row, "served_at")?,
-                head: (
-                    row.try_get("priority")?,
-                    time(row, "submitted_at")?,
-                    from_key(row.try_get("id")?)?,
-                ),
-                locked: None,
-            })
-        })
-        .collect()
+    let mut queues = Vec::new();
+    for row in rows {
+        let Some(priority) = row.try_get::<Option<i64>, _>("priority")? else {
+            continue;
+        };
+        let queue = Queue {
+            collection: collection_from(&row)?,
+            running: count(row.try_get("running")?),
+            served_at: optional_time(&row, "served_at")?,
+            head: (
+                priority,
+                time(&row, "submitted_at")?,
+                from_key(row.try_get("id")?)?,
+            ),
+            locked: None,
+        };
+        let limit = u64::from(queue.collection.max_running);
+        if limit == 0 || queue.running < limit {
+            queues.push(queue);
+        }
+    }
+    Ok(queues)
 }
 
 /// The next job for a worker, its row locked; `at_most` jobs are wanted in this transaction from now on. A queue from

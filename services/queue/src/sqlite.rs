@@ -30,6 +30,8 @@ mod sql;
 pub use sql::SqlStore as SqliteStore;
 
 const READERS: u32 = 4;
+/// One writer, so one transaction.
+const GROUPS_AT_ONCE: usize = 1;
 
 /// What brings the schema up to date. One that is ahead, because a newer coordinator was here, is worked with: each step
 /// leaves the program before it working.

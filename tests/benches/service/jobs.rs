@@ -185,11 +185,6 @@ pub(crate) async fn status(
 /// Workers that lease and complete as fast as they can; cycles per second.
 pub(crate) async fn cycles(service: &Service, load: Load) -> Result<f64> {
     let bundle = service.upload("bench/o0", b"a bundle's only file\n").await?;
-    let files: Vec<v1::FileEntry> = vec![(&FileEntry {
-        path: "bundle.json".parse()?,
-        ..bundle
-    })
-        .into()];
     let done = Arc::new(AtomicUsize::new(0));
     let mut workers = Vec::new();
     for number in 0..load.workers {
@@ -204,15 +199,20 @@ pub(crate) async fn cycles(service: &Service, load: Load) -> Result<f64> {
     let begun = Instant::now();
     let until = begun + Duration::from_secs_f64(load.secs);
     let tasks = workers.into_iter().map(|(name, mut worker)| {
-        let (done, files) = (done.clone(), files.clone());
+        let (done, bundle) = (done.clone(), bundle.clone());
         tokio::spawn(async move {
             while Instant::now() < until {
                 let lease = worker.lease(lease_request(&name, 5.0)).await?;
                 let lease = lease.into_inner().lease.context("the queue is empty")?;
+                // As real bundles do, each has a manifest of its own.
+                let file = FileEntry {
+                    path: format!("{}.json", lease.job_id).parse()?,
+                    ..bundle.clone()
+                };
                 worker
                     .complete(v1::CompleteRequest {
                         job: attempt(&lease, &name),
-                        files: files.clone(),
+                        files: vec![(&file).into()],
                         metrics_json: r#"{"mse":4.9}"#.to_owned(),
                     })
                     .await?;

@@ -66,10 +66,11 @@ fn main() -> Result<()> {
 /// Everything about jobs on Postgres, with bundles on the local disk.
 async fn postgres(figures: &mut Figures, load: Load) -> Result<()> {
     let postgres = Postgres::start_durable()?;
-    let service = Service::start(&postgres.create_database()?).await?;
-    jobs::pickup(figures, &service, "Postgres").await?;
-    jobs::connected(figures, &service, load).await?;
-    drop(service);
+    if load.connected > 0 {
+        let service = Service::start(&postgres.create_database()?).await?;
+        jobs::pickup(figures, &service, "Postgres").await?;
+        jobs::connected(figures, &service, load).await?;
+    }
     let service = Service::start(&postgres.create_database()?).await?;
     jobs::submit(figures, &service, load, "Postgres").await?;
     jobs::status(figures, &service, load, "Postgres").await?;
