@@ -74,12 +74,7 @@ impl App {
     }
 
     async fn try_mirror(&self, object: &ObjectName, only: Option<u32>) -> Result<(), Refused> {
-        let filter = VersionFilter {
-            collection: Some(object.collection.clone()),
-            object: Some(object.object.clone()),
-            include_retired: true,
-        };
-        let mut versions = self.store.versions(&filter).await?;
+        let mut versions = self.store.versions_of(object).await?;
         for version in versions
             .iter()
             .filter(|it| only.is_none_or(|only| it.version == only))
@@ -89,7 +84,7 @@ impl App {
         loop {
             let state = state(&versions);
             self.registry.put_state(object, &state).await?;
-            versions = self.store.versions(&filter).await?;
+            versions = self.store.versions_of(object).await?;
             if self::state(&versions) == state {
                 return Ok(());
             }

@@ -52,7 +52,7 @@ const LOCK_FREE_ROWS: &str = "for no key update skip locked";
 const ALIAS_LIST: &str = "string_agg(a.alias, ',')";
 
 /// Transactions of one kind at a time: one waits for the disk while another reads.
-const GROUPS_AT_ONCE: usize = 3;
+const GROUPS_AT_ONCE: usize = 2;
 
 /// The pool, and the tasks that pass changes on; they end with the last store.
 #[derive(Debug)]

@@ -66,6 +66,7 @@ pub struct SqlStore {
     settings: Settings,
     leases: Group<LeaseAsk, Result<Option<Job>>>,
     publishes: Group<PublishAsk, Option<Result<Version>>>,
+    lookups: Group<ObjectName, Result<Vec<Version>>>,
 }
 
 fn sql(text: String) -> AssertSqlSafe<String> {
@@ -532,6 +533,7 @@ impl SqlStore {
             settings,
             leases: Group::new(GROUPS_AT_ONCE),
             publishes: Group::new(GROUPS_AT_ONCE),
+            lookups: Group::new(GROUPS_AT_ONCE),
         }
     }
 
@@ -859,6 +861,24 @@ impl SqlStore {
         }
         .await;
         self.finish(transaction, outcome, Change::Work).await
+    }
+
+    /// The versions of each of several objects.
+    async fn versions_of_all(&self, objects: &[ObjectName]) -> Result<Vec<Vec<Version>>> {
+        let mut query = select_versions();
+        query.push(" and (v.collection, v.object) in (");
+        query.push_values(objects, |mut row, object| {
+            row.push_bind(object.collection.as_str())
+                .push_bind(object.object.as_str());
+        });
+        query.push(") order by v.version");
+        let mut found: BTreeMap<ObjectName, Vec<Version>> = BTreeMap::new();
+        for row in query.build().fetch_all(self.backend.reader()).await? {
+            let version = version_from(&row)?;
+            found.entry(version.object.clone()).or_default().push(version);
+        }
+        let of = |object| found.get(object).cloned().unwrap_or_default();
+        Ok(objects.iter().map(of).collect())
     }
 
     /// Takes back leases that ran out, at most [`REAP_BATCH`], and forgets workers that are long gone.
@@ -1773,6 +1793,17 @@ impl Store for SqlStore {
         // Here and not in SQL: the order of text there depends on the database's locale.
         versions.sort_by(|a, b| (&a.object, a.version).cmp(&(&b.object, b.version)));
         Ok(versions)
+    }
+
+    async fn versions_of(&self, object: &ObjectName) -> Result<Vec<Version>> {
+        let run = |objects: Vec<ObjectName>| async move {
+            match self.versions_of_all(&objects).await {
+                Ok(versions) => versions.into_iter().map(Ok).collect(),
+                Err(error) => objects.iter().map(|_| Err(shared(&error))).collect(),
+            }
+        };
+        let found = self.lookups.join(object.clone(), run).await;
+        found.unwrap_or_else(|| Err(cut_off()))
     }
 
     async fn version(&self, object: &ObjectName, reference: &str) -> Result<Version> {

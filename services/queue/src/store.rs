@@ -468,6 +468,9 @@ pub trait Store: Tokens + Webhooks + Send + Sync + std::fmt::Debug + 'static {
     /// Published bundles by collection, object and version.
     async fn versions(&self, filter: &VersionFilter) -> Result<Vec<Version>>;
 
+    /// All bundles of one object by version, retired ones too.
+    async fn versions_of(&self, object: &ObjectName) -> Result<Vec<Version>>;
+
     /// One bundle by version (`v3`), alias (`latest`) or manifest digest; empty means `latest`.
     async fn version(&self, object: &ObjectName, reference: &str) -> Result<Version>;
 
