@@ -4,11 +4,9 @@
 //! listed file is there. Bags that say where to fetch missing files (`fetch.txt`) are refused: nothing is downloaded.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Read as _;
 use std::path::{Component, Path, PathBuf};
 
-use sha2::digest::DynDigest;
-
+use crate::memory::Checksums;
 use crate::problem::Problem;
 
 /// What makes a folder a bag.
@@ -58,9 +56,11 @@ fn verify(bag: &Path) -> Result<Vec<String>, Problem> {
     };
     let mut faults = Vec::new();
     let listed = listed(&text, &mut faults);
+    // What is read here is not read again for the store.
+    let checksums = Checksums::default();
     for (file, expected) in &listed {
-        match checksum(&bag.join(file), algorithm) {
-            Ok(found) if found.eq_ignore_ascii_case(expected) => {}
+        match checksums.of(&bag.join(file), Some(algorithm), &|_| ()) {
+            Ok(read) if read.sum(algorithm).eq_ignore_ascii_case(expected) => {}
             Ok(_) => faults.push(format!("{file} does not have its {algorithm} checksum")),
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
                 faults.push(format!("{file} is missing"));
@@ -131,24 +131,6 @@ fn payload_files(bag: &Path) -> Result<BTreeSet<String>, Problem> {
         }
     }
     Ok(files)
-}
-
-fn checksum(file: &Path, algorithm: &str) -> std::io::Result<String> {
-    let mut hash: Box<dyn DynDigest> = match algorithm {
-        "sha512" => Box::new(sha2::Sha512::default()),
-        "sha256" => Box::new(sha2::Sha256::default()),
-        "sha1" => Box::new(sha1::Sha1::default()),
-        _ => Box::new(md5::Md5::default()),
-    };
-    let mut reader = std::fs::File::open(file)?;
-    let mut buffer = vec![0; 1 << 18];
-    loop {
-        let count = reader.read(&mut buffer)?;
-        if count == 0 {
-            return Ok(hex::encode(hash.finalize()));
-        }
-        hash.update(&buffer[..count]);
-    }
 }
 
 #[cfg(test)]

@@ -14,6 +14,7 @@ use reqwest::{Client, Method, RequestBuilder, Response, StatusCode, Url};
 use sha2::{Digest as _, Sha256};
 use tokio::io::{AsyncReadExt as _, AsyncSeekExt as _, AsyncWriteExt as _};
 
+use crate::memory::OpenUpload;
 use crate::pack::{PackedFile, Source};
 use crate::problem::{Doing as _, Exit, Problem, chain};
 
@@ -27,6 +28,7 @@ const TRIES: u32 = 6;
 /// Client of one object's repository.
 #[derive(Clone)]
 pub(crate) struct DataPlane {
+    object: ObjectName,
     repository: Url,
     http: Client,
     headers: HeaderMap,
@@ -48,6 +50,7 @@ impl DataPlane {
         value.set_sensitive(true);
         let headers = HeaderMap::from_iter([(reqwest::header::AUTHORIZATION, value)]);
         Ok(Self {
+            object: object.clone(),
             repository,
             http,
             headers,
@@ -72,6 +75,15 @@ impl DataPlane {
     /// Whether the store has this blob already.
     pub(crate) async fn has(&self, digest: &Digest) -> Result<bool, Problem> {
         let path = format!("blobs/{digest}");
+        let answer =
+            retrying(|| async { checked(self.request(Method::HEAD, &path)?.send().await?).await })
+                .await;
+        absent_is_none(answer).map(|found| found.is_some())
+    }
+
+    /// Whether the store has the manifest of a capture, and so the capture: it is written last.
+    pub(crate) async fn has_manifest(&self, digest: &Digest) -> Result<bool, Problem> {
+        let path = format!("manifests/{digest}");
         let answer =
             retrying(|| async { checked(self.request(Method::HEAD, &path)?.send().await?).await })
                 .await;
@@ -142,8 +154,9 @@ impl DataPlane {
         let mut reader = tokio::fs::File::open(file)
             .await
             .doing("cannot read", file.display())?;
-        let mut upload = self.open_upload().await?;
-        let mut offset = 0;
+        let remembered = OpenUpload::of(self.repository.as_str(), &self.object, digest);
+        let (mut upload, mut offset) = self.go_on(&remembered, size_bytes).await?;
+        sent(offset as i64);
         let mut tries = 0;
         while offset < size_bytes {
             let length = PART_BYTES.min(size_bytes - offset);
@@ -184,6 +197,7 @@ impl DataPlane {
                         Ok(Some(held)) => held.min(size_bytes),
                         Ok(None) => {
                             upload = self.open_upload().await?;
+                            remembered.remember(&upload);
                             0
                         }
                         Err(_) => continue,
@@ -193,7 +207,29 @@ impl DataPlane {
                 }
             }
         }
-        self.finish(&upload, digest, Vec::new()).await
+        // Whatever the answer, this upload is at its end: one that was refused would be refused again.
+        let finished = self.finish(&upload, digest, Vec::new()).await;
+        if !matches!(&finished, Err(problem) if problem.exit == Exit::Unreachable) {
+            remembered.forget();
+        }
+        finished
+    }
+
+    /// The upload that an earlier run began, with the bytes that the server has of it; otherwise a new one.
+    async fn go_on(
+        &self,
+        remembered: &OpenUpload,
+        size_bytes: u64,
+    ) -> Result<(String, u64), Problem> {
+        if let Some(upload) = remembered.location()
+            && let Ok(Some(held)) = self.upload_offset(&upload).await
+            && held <= size_bytes
+        {
+            return Ok((upload, held));
+        }
+        let upload = self.open_upload().await?;
+        remembered.remember(&upload);
+        Ok((upload, 0))
     }
 
     async fn open_upload(&self) -> Result<String, Problem> {

@@ -14,6 +14,7 @@ mod data_plane;
 mod embedded;
 #[doc(hidden)]
 pub mod fuzz;
+mod memory;
 mod output;
 mod pack;
 mod problem;

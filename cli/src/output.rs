@@ -366,9 +366,10 @@ impl Live {
         if self.plain {
             let total = self.bar.length().unwrap_or(0);
             let text = format!(
-                "{} of {}",
+                "{} of {}, eta {}",
                 self::bytes(self.bar.position().min(total)),
-                self::bytes(total)
+                self::bytes(total),
+                duration(self.bar.eta().as_secs_f64())
             );
             let prefix = self.bar.prefix();
             self.say(&prefix, &format!("{prefix} {text}"));

@@ -8,11 +8,12 @@
 //! machine and is never stored or sent twice.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use futures::{StreamExt as _, TryStreamExt as _};
 use ign_proto::{Digest, FileEntry, FilePath, Kind, Manifest};
-use sha2::{Digest as _, Sha256};
 
+use crate::memory::Checksums;
 use crate::problem::{Doing as _, Problem, chain};
 
 /// Folders taken whole.
@@ -277,17 +278,19 @@ pub(crate) fn capture_toml(capture: &Path) -> Option<toml::Table> {
         .ok()
 }
 
-/// Hashes the files, as many at a time as there are cores, and writes the manifest; `hashed` hears of the bytes.
+/// Hashes the files, as many at a time as there are cores, and writes the manifest; `hashed` hears of the bytes. Files that
+/// an earlier run has read and that are unchanged since are not read again.
 pub(crate) async fn pack(
     files: Vec<SourceFile>,
     hashed: impl Fn(u64) + Clone + Send + 'static,
 ) -> Result<Packed, Problem> {
     let at_once = std::thread::available_parallelism().map_or(2, usize::from);
+    let checksums = Arc::new(Checksums::default());
     let files: Vec<PackedFile> = futures::stream::iter(files)
         .map(|file| {
-            let hashed = hashed.clone();
+            let (hashed, checksums) = (hashed.clone(), checksums.clone());
             async move {
-                tokio::task::spawn_blocking(move || hash_file(file, &hashed))
+                tokio::task::spawn_blocking(move || hash_file(file, &checksums, &hashed))
                     .await
                     .map_err(|error| Problem::failed(format!("hashing stopped: {error}")))?
             }
@@ -304,8 +307,11 @@ pub(crate) async fn pack(
     })
 }
 
-fn hash_file(mut file: SourceFile, hashed: &impl Fn(u64)) -> Result<PackedFile, Problem> {
-    use std::io::Read as _;
+fn hash_file(
+    mut file: SourceFile,
+    checksums: &Checksums,
+    hashed: &impl Fn(u64),
+) -> Result<PackedFile, Problem> {
     let Source::File(source) = &file.source else {
         return Ok(PackedFile {
             digest: Digest::of(NOTHING),
@@ -313,25 +319,15 @@ fn hash_file(mut file: SourceFile, hashed: &impl Fn(u64)) -> Result<PackedFile, 
         });
     };
     let at = source.display().to_string();
-    let mut reader = std::fs::File::open(source).doing("cannot read", &at)?;
-    let mut hash = Sha256::new();
-    let mut buffer = vec![0; 1 << 18];
-    let mut size_bytes = 0;
-    loop {
-        let count = reader.read(&mut buffer).doing("cannot read", &at)?;
-        if count == 0 {
-            break;
-        }
-        hash.update(&buffer[..count]);
-        size_bytes += count as u64;
-        hashed(count as u64);
-    }
+    let read = checksums
+        .of(source, None, hashed)
+        .doing("cannot read", &at)?;
+    let digest = read
+        .sha256()
+        .ok_or_else(|| Problem::failed("the file has no checksum").at(&at))?;
     // What was hashed counts, should the file have grown since it was listed.
-    file.size_bytes = size_bytes;
-    Ok(PackedFile {
-        file,
-        digest: Digest::from_sha256(hash.finalize().into()),
-    })
+    file.size_bytes = read.size_bytes;
+    Ok(PackedFile { file, digest })
 }
 
 fn manifest(files: &[PackedFile]) -> Result<Vec<u8>, Problem> {

@@ -28,6 +28,17 @@ class Case:
     """At most this many runs of the peer, where it is slow."""
 
 
+@dataclass(frozen=True)
+class ServiceCase:
+    """A benchmark program that starts its own peers, and prints its figures with their targets."""
+    name: str
+    does: str
+    package: str
+    bench: str
+    programs: tuple[str, ...]
+    """Crates whose programs it starts."""
+
+
 def mesh_bytes(result):
     """Half of the mesh, the side that is seen, read once per view: f32 positions and indices."""
     return (12 * result["vertices"] + 12 * result["triangles"]) / 2
@@ -77,5 +88,13 @@ CASES = [
         peer="pillow_import.py", unit="view", views=1000,
         limit_bytes=lambda r: r["photograph_bytes"] + r["output_bytes"],
         limit_means="the file read once, the picture written once",
+    ),
+]
+
+SERVICES = [
+    ServiceCase(
+        name="service",
+        does="coordinator, Postgres and SQLite under load through gRPC and HTTP; peers: pgbench -N, curl to the S3 server",
+        package="ign-e2e", bench="service", programs=("ign-coordinator", "ignctl", "ign-testkit"),
     ),
 ]

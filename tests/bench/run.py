@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 
-from cases import CASES
+from cases import CASES, SERVICES
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 ROOT = os.path.dirname(os.path.dirname(HERE))
@@ -61,6 +61,46 @@ def build(cases):
             if message.get("executable") and message["target"]["kind"] == ["bench"]:
                 programs[package, message["target"]["name"]] = message["executable"]
     return programs
+
+
+def measure_service(case, program, arguments):
+    """Figures of a program that brings its own peers; it says what it is at on stderr, among the logs of what it runs."""
+    command = ["cargo", "build", "--release", "--locked", "--bins"]
+    for package in case.programs:
+        command += ["-p", package]
+    say("$ " + " ".join(command))
+    subprocess.run(command, cwd=ROOT, check=True)
+    with subprocess.Popen([program, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        tail = []
+        for line in running.stderr:
+            tail = [*tail[-60:], line]
+            if line.startswith("service: "):
+                say(line.rstrip())
+        output = running.stdout.read()
+    if running.returncode != 0:
+        raise SystemExit("".join(tail) + f"bench: error: {case.name} failed with status {running.returncode}")
+    return {"name": case.name, "does": case.does, **json.loads(output.splitlines()[-1])}
+
+
+def service_table(result):
+    """One line a figure: value, target, whether it holds, and the peer's share."""
+    def shown(figure):
+        value = f"{figure['value']:,.3g}" if figure["value"] < 100 else f"{figure['value']:,.0f}"
+        return f"{value} {figure['unit']}"
+
+    def note(figure):
+        if "peer" in figure:
+            return f"{figure['share_of_peer']:.2f} x {figure['peer_name']} ({figure['peer']:,.0f})"
+        if "median_ms" in figure:
+            return f"median {figure['median_ms']:.1f} ms, worst {figure['worst_ms']:.0f} ms of {figure['runs']}"
+        return ""
+
+    rows = [["figure", "value", "target", "", "beside"]]
+    holds = {True: "met", False: "MISSED", None: ""}
+    rows += [[it["name"], shown(it), it["target"] or "", holds[it["holds"]], note(it)] for it in result["figures"]]
+    widths = [max(len(row[at]) for row in rows) for at in range(5)]
+    lines = ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+    return "\n".join([f"{result['name']}: {result['does']}", *lines])
 
 
 def result_of(command, threads):
@@ -170,33 +210,42 @@ def table(result):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases; all of them by default")
+    parser.add_argument("--service", default="", metavar="ARGS", help="options of the service case, such as '--rows 20000'")
     parser.add_argument("--views", type=int, help="views of every case, instead of its own number")
     parser.add_argument("--rounds", type=int, default=3, help="runs of each side, in turn (default 3)")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="default 1 2")
     parser.add_argument("--json", default=os.path.join(ROOT, "bench-out", "bench.json"), help="where the figures go")
     options = parser.parse_args()
-    unknown = set(options.names) - {case.name for case in CASES}
+    known = [case.name for case in [*CASES, *SERVICES]]
+    unknown = set(options.names) - set(known)
     if unknown:
-        parser.error(f"no case {', '.join(sorted(unknown))}; there are {', '.join(case.name for case in CASES)}")
+        parser.error(f"no case {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     cases = [case for case in CASES if not options.names or case.name in options.names]
-    python = environment()
-    programs = build(cases)
+    services = [case for case in SERVICES if not options.names or case.name in options.names]
+    python = environment() if cases else None
+    programs = build([*cases, *services])
     started, load = time.monotonic(), os.getloadavg()
-    bandwidths = {threads: bandwidth(python, threads) for threads in options.threads}
+    bandwidths = {threads: bandwidth(python, threads) for threads in options.threads if cases}
     results = [measure(case, programs[case.package, case.bench], python, options, bandwidths) for case in cases]
+    figures = [
+        measure_service(case, programs[case.package, case.bench], ["--rounds", str(options.rounds), *options.service.split()])
+        for case in services
+    ]
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
     report = {
         "commit": commit.stdout.strip(), "machine": platform.machine(), "cores": os.cpu_count(),
         "load_before": load, "load_after": os.getloadavg(),
-        "bandwidth_bytes_per_second": bandwidths, "results": results,
+        "bandwidth_bytes_per_second": bandwidths, "results": [*results, *figures],
     }
     os.makedirs(os.path.dirname(os.path.abspath(options.json)), exist_ok=True)
     with open(options.json, "w", encoding="utf-8") as file:
         json.dump(report, file, indent=1)
     for result in results:
         print(table(result) + "\n")
-    speeds = ", ".join(f"{value / 1e9:.1f} GB/s with {threads}" for threads, value in bandwidths.items())
-    print(f"{os.cpu_count()} cores, load {load[0]:.1f} before and {os.getloadavg()[0]:.1f} after; copying: {speeds}; "
+    for result in figures:
+        print(service_table(result) + "\n")
+    speeds = "".join(f"copying: {value / 1e9:.1f} GB/s with {threads}; " for threads, value in bandwidths.items())
+    print(f"{os.cpu_count()} cores, load {load[0]:.1f} before and {os.getloadavg()[0]:.1f} after; {speeds}"
           f"medians of {options.rounds}; {(time.monotonic() - started) / 60:.1f} min; figures in {options.json}")
 
 

@@ -1,15 +1,18 @@
 //! `submit`: queues captures, or checks them without sending anything.
 //!
 //! Request ids follow from content (object, capture, recipe, priority), so repeating a submit after a broken connection
-//! finds the jobs it had queued and sends no byte twice. One bad capture does not stop the others.
+//! finds the jobs it had queued and sends no byte twice, even if it was killed in the middle of a file. One bad capture
+//! does not stop the others.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use chrono::{DateTime, Utc};
+use futures::{StreamExt as _, TryStreamExt as _};
 use ign_capture::{Fault, Findings, PreflightOptions, Severity};
-use ign_proto::{CollectionId, ObjectName, v1};
+use ign_proto::{CollectionId, Digest, ObjectName, v1};
 use serde::Serialize;
+use tokio::sync::mpsc;
 
 use crate::Context;
 use crate::bag;
@@ -19,8 +22,13 @@ use crate::output::{self, Table};
 use crate::pack;
 use crate::problem::{Doing as _, Exit, Problem};
 use crate::recipe::{RecipeArgs, key_value};
-use crate::upload::{self, Order};
+use crate::upload::{self, Order, Uploader};
 use crate::views::{JobView, ShortIds, short_id, time};
+
+/// Captures that are hashed and sent at the same time.
+const CAPTURES_AT_ONCE: usize = 4;
+/// Rows that are queued by one call.
+const ROWS_A_CALL: usize = 500;
 
 /// Arguments of `submit`.
 #[derive(Debug, clap::Args)]
@@ -401,7 +409,8 @@ fn duplicates(orders: &[Order]) -> Vec<Problem> {
     problems
 }
 
-/// Uploads and queues one after the other; ends early only when the coordinator is gone.
+/// Uploads captures, several at a time, and queues their rows as they arrive; ends early only when the coordinator is
+/// gone. Rows that name the same capture share its upload.
 async fn submit_all(
     connection: &Connection,
     orders: &[Order],
@@ -409,56 +418,146 @@ async fn submit_all(
     began: DateTime<Utc>,
     errors: &mut ErrorList,
 ) -> Result<(Vec<RowView>, Option<Problem>), Problem> {
-    let mut rows = Vec::new();
+    let mut captures: BTreeMap<(&Path, &CollectionId), Vec<usize>> = BTreeMap::new();
     for (index, order) in orders.iter().enumerate() {
-        let row = |outcome, job, error| RowView {
-            path: order.capture.clone(),
-            collection: order.object.collection.to_string(),
-            object: order.object.object.to_string(),
-            outcome,
-            job,
-            error,
-        };
-        let count = format!("{}/{}", index + 1, orders.len());
-        match submit_one(connection, order, salt).await {
-            Ok(job) => {
-                // The same request returns the same job: one from before this command began is an older submit's.
-                let known = time(job.submitted_at.as_ref()).is_some_and(|at| at < began);
-                let outcome = if known { "known" } else { "submitted" };
-                output::note(&format!(
-                    "{count}  {}  {outcome}, job {}",
-                    order.object,
-                    short_id(&job.id)
-                ));
-                rows.push(row(outcome, Some(JobView::from(&job)), None));
+        let at = (order.capture.as_path(), &order.object.collection);
+        captures.entry(at).or_default().push(index);
+    }
+    // In the order of the list, so that a run that is cut off has done its beginning.
+    let mut captures: Vec<Vec<usize>> = captures.into_values().collect();
+    captures.sort();
+    let total = captures
+        .iter()
+        .map(|rows| orders[rows[0]].size_bytes())
+        .sum();
+    let uploader = Uploader::new(connection, total);
+    let (sender, uploaded) = mpsc::channel(ROWS_A_CALL);
+    let uploads = async {
+        // Its end, which ends the queueing, is the end of this block.
+        let sender = sender;
+        let captures = futures::stream::iter(captures.into_iter().map(Ok));
+        let upload = async |captured: Vec<usize>| {
+            let outcome = uploader.upload(&orders[captured[0]], false).await;
+            for row in captured {
+                sender.send((row, outcome.clone())).await?;
             }
-            Err(problem) => {
-                output::problem(
-                    &problem
-                        .clone()
-                        .context(format!("{count}  {}", order.object)),
-                );
-                let stop = problem.exit == Exit::Unreachable;
-                rows.push(row("error", None, Some(problem.what.clone())));
-                errors.problem(Some(order), &problem)?;
-                if stop {
-                    return Ok((rows, Some(problem)));
-                }
+            Ok::<(), mpsc::error::SendError<_>>(())
+        };
+        // Cut short when nobody queues any more.
+        captures
+            .try_for_each_concurrent(CAPTURES_AT_ONCE, upload)
+            .await
+            .ok();
+    };
+    let queueing = async {
+        // Ends with this block, however it ends, and with it the uploads.
+        let mut uploaded = uploaded;
+        let mut rows: BTreeMap<usize, RowView> = BTreeMap::new();
+        let mut stopped = None;
+        let mut chunk = Vec::new();
+        while stopped.is_none() && uploaded.recv_many(&mut chunk, ROWS_A_CALL).await > 0 {
+            let chunk = std::mem::take(&mut chunk);
+            for (index, outcome) in queue(&uploader, connection, orders, salt, chunk).await? {
+                let order = &orders[index];
+                let (outcome, job, error) = match outcome {
+                    Ok(job) => {
+                        // The same request returns the same job: one from before this command began is an older
+                        // submit's.
+                        let known = time(job.submitted_at.as_ref()).is_some_and(|at| at < began);
+                        let outcome = if known { "known" } else { "submitted" };
+                        uploader.say(&format!(
+                            "{}/{}  {}  {outcome}, job {}",
+                            rows.len() + 1,
+                            orders.len(),
+                            order.object,
+                            short_id(&job.id)
+                        ));
+                        (outcome, Some(JobView::from(&job)), None)
+                    }
+                    Err(problem) => {
+                        output::problem(&problem.clone().context(order.object.to_string()));
+                        errors.problem(Some(order), &problem)?;
+                        let what = problem.what.clone();
+                        if problem.exit == Exit::Unreachable {
+                            stopped.get_or_insert(problem);
+                        }
+                        ("error", None, Some(what))
+                    }
+                };
+                let row = RowView {
+                    path: order.capture.clone(),
+                    collection: order.object.collection.to_string(),
+                    object: order.object.object.to_string(),
+                    outcome,
+                    job,
+                    error,
+                };
+                rows.insert(index, row);
             }
         }
-    }
-    Ok((rows, None))
+        Ok((rows.into_values().collect(), stopped))
+    };
+    let ((), queued) = tokio::join!(uploads, queueing);
+    queued
 }
 
-async fn submit_one(
+type Outcome = Result<v1::Job, Problem>;
+
+/// Queues rows whose captures were uploaded. Where the registry names a capture whose files have gone, they are sent again.
+async fn queue(
+    uploader: &Uploader<'_>,
     connection: &Connection,
-    order: &Order,
+    orders: &[Order],
     salt: &str,
-) -> Result<v1::Job, Problem> {
-    let capture = upload::upload(connection, order).await?;
-    let spec = upload::spec(order, &capture)?;
-    let request_id = upload::request_id(&spec, salt);
-    upload::submit(connection, spec, request_id).await
+    uploaded: Vec<(usize, Result<Digest, Problem>)>,
+) -> Result<Vec<(usize, Outcome)>, Problem> {
+    let request = |index: usize, capture: &Digest| -> Result<v1::SubmitRequest, Problem> {
+        let spec = upload::spec(&orders[index], capture)?;
+        Ok(v1::SubmitRequest {
+            request_id: upload::request_id(&spec, salt),
+            spec: Some(spec),
+        })
+    };
+    let (mut outcomes, mut waiting, mut requests) = (Vec::new(), Vec::new(), Vec::new());
+    for (index, capture) in uploaded {
+        match capture {
+            Ok(capture) => {
+                requests.push(request(index, &capture)?);
+                waiting.push(index);
+            }
+            Err(problem) => outcomes.push((index, Err(problem))),
+        }
+    }
+    if requests.is_empty() {
+        return Ok(outcomes);
+    }
+    let answers = match upload::submit_all(connection, requests).await {
+        Ok(answers) => answers,
+        Err(problem) => {
+            outcomes.extend(
+                waiting
+                    .into_iter()
+                    .map(|index| (index, Err(problem.clone()))),
+            );
+            return Ok(outcomes);
+        }
+    };
+    for (index, answer) in waiting.into_iter().zip(answers) {
+        let outcome = match answer {
+            Ok(job) => Ok(job),
+            Err(refused) if refused.capture_is_missing => {
+                let again = async {
+                    let capture = uploader.upload(&orders[index], true).await?;
+                    let v1::SubmitRequest { request_id, spec } = request(index, &capture)?;
+                    upload::submit(connection, spec.unwrap_or_default(), request_id).await
+                };
+                again.await
+            }
+            Err(refused) => Err(refused.problem),
+        };
+        outcomes.push((index, outcome));
+    }
+    Ok(outcomes)
 }
 
 fn table(rows: &[RowView]) -> String {
@@ -487,15 +586,17 @@ async fn dry_run(
     orders: Vec<Order>,
     errors: &mut ErrorList,
 ) -> Result<(), Problem> {
-    let mut checks = Vec::new();
     let total = orders.len();
-    for (index, order) in orders.into_iter().enumerate() {
+    let at_once = std::thread::available_parallelism().map_or(2, usize::from);
+    let mut checking = futures::stream::iter(orders.into_iter().map(check)).buffered(at_once);
+    let mut checks = Vec::new();
+    while let Some(check) = checking.next().await {
+        let check = check?;
         output::note(&format!(
-            "{}/{total}  checking {}",
-            index + 1,
-            order.capture.display()
+            "{}/{total}  checked {}",
+            checks.len() + 1,
+            check.path.display()
         ));
-        let check = check(order).await?;
         errors.check(&check)?;
         checks.push(check);
     }

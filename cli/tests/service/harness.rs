@@ -30,6 +30,11 @@ fn command(args: &[&str], env: &[(&str, &str)]) -> Command {
     }
     command
         .args(args)
+        // Not the user's own memory of checksums and uploads.
+        .env(
+            "XDG_CACHE_HOME",
+            concat!(env!("CARGO_TARGET_TMPDIR"), "/cache"),
+        )
         .envs(env.iter().copied())
         .stdin(Stdio::null());
     command
@@ -91,7 +96,7 @@ pub(crate) fn script(dir: &Path, name: &str, text: &str) -> PathBuf {
     path
 }
 
-fn wait_until<T>(what: &str, mut ready: impl FnMut() -> Option<T>) -> T {
+pub(crate) fn wait_until<T>(what: &str, mut ready: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
     loop {
         if let Some(value) = ready() {

@@ -5,6 +5,7 @@
     reason = "a test fails by panicking; the message of the panic is the report"
 )]
 
+mod bulk;
 mod harness;
 mod worker;
 

@@ -433,9 +433,8 @@ async fn point_aliases(
     alias: &str,
     targets: impl IntoIterator<Item = (&ObjectName, u32)>,
 ) -> Result<()> {
-    let mut insert = QueryBuilder::<Db>::new(
-        "insert into aliases (collection, object, alias, version) ",
-    );
+    let mut insert =
+        QueryBuilder::<Db>::new("insert into aliases (collection, object, alias, version) ");
     insert.push_values(targets, |mut row, (object, version)| {
         row.push_bind(object.collection.as_str())
             .push_bind(object.object.as_str())
@@ -784,7 +783,8 @@ impl SqlStore {
     ) -> Result<Vec<Option<Result<Version>>>> {
         let (mut transaction, now) = self.begin().await?;
         let outcome = async {
-            let mut jobs = lock_jobs(&mut transaction, asks.iter().map(|ask| ask.job), lock).await?;
+            let mut jobs =
+                lock_jobs(&mut transaction, asks.iter().map(|ask| ask.job), lock).await?;
             let mut answers: Vec<Option<Result<Version>>> = Vec::new();
             let mut holding = Vec::new();
             for ask in asks {
@@ -797,7 +797,8 @@ impl SqlStore {
                         let reference = format!("v{version}");
                         let published =
                             find_version(&mut transaction, &job.spec.object, &reference).await?;
-                        Some(published).filter(|it| it.bundle.manifest_digest == ask.bundle.manifest_digest)
+                        Some(published)
+                            .filter(|it| it.bundle.manifest_digest == ask.bundle.manifest_digest)
                     }
                     _ => None,
                 };
@@ -875,7 +876,10 @@ impl SqlStore {
         let mut found: BTreeMap<ObjectName, Vec<Version>> = BTreeMap::new();
         for row in query.build().fetch_all(self.backend.reader()).await? {
             let version = version_from(&row)?;
-            found.entry(version.object.clone()).or_default().push(version);
+            found
+                .entry(version.object.clone())
+                .or_default()
+                .push(version);
         }
         let of = |object| found.get(object).cloned().unwrap_or_default();
         Ok(objects.iter().map(of).collect())
@@ -924,7 +928,9 @@ struct LeaseAsk {
 impl LeaseAsk {
     fn takes_from(&self, queue: &Queue) -> bool {
         let name = &queue.collection.name;
-        self.within.as_ref().is_none_or(|within| within.contains(name))
+        self.within
+            .as_ref()
+            .is_none_or(|within| within.contains(name))
     }
 }
 
@@ -1127,8 +1133,7 @@ async fn advance_objects(
     connection: &mut Connection,
     newest: &BTreeMap<&ObjectName, u32>,
 ) -> Result<()> {
-    let mut update =
-        QueryBuilder::<Db>::new("update objects set last_version = v.column3 from (");
+    let mut update = QueryBuilder::<Db>::new("update objects set last_version = v.column3 from (");
     update.push_values(newest, |mut row, (object, version)| {
         row.push_bind(object.collection.as_str())
             .push_bind(object.object.as_str())
@@ -1246,16 +1251,13 @@ async fn older_equals(reader: &mut Connection, jobs: &[&Job]) -> Result<BTreeMap
             row.push_bind(key(job.id))
                 .push_bind(job.spec.object.collection.as_str())
                 .push_bind(i64::from(job.spec.priority))
-                .push_bind(to_db(from.map_or(DateTime::UNIX_EPOCH, |job| job.submitted_at)))
+                .push_bind(to_db(
+                    from.map_or(DateTime::UNIX_EPOCH, |job| job.submitted_at),
+                ))
                 .push_bind(key(from.map_or(uuid::Uuid::nil().into(), |job| job.id)))
                 .push_bind(to_db(job.submitted_at));
         });
-        for row in select
-            .push(") v")
-            .build()
-            .fetch_all(&mut *reader)
-            .await?
-        {
+        for row in select.push(") v").build().fetch_all(&mut *reader).await? {
             between.insert(from_key(row.try_get("id")?)?, count(row.try_get("jobs")?));
         }
     }

@@ -67,7 +67,8 @@ impl Figures {
     pub(crate) fn p95_ms(&mut self, name: &str, times: &[Duration], target: Option<Target>) {
         let mut ms: Vec<f64> = times.iter().map(|time| time.as_secs_f64() * 1e3).collect();
         ms.sort_by(f64::total_cmp);
-        let at = |share: f64| ms[((ms.len() as f64 * share).ceil() as usize).clamp(1, ms.len()) - 1];
+        let at =
+            |share: f64| ms[((ms.len() as f64 * share).ceil() as usize).clamp(1, ms.len()) - 1];
         let more = json!({ "runs": ms.len(), "median_ms": at(0.5), "worst_ms": at(1.0) });
         let value = at(0.95);
         let target = target.map(|it| (it.text("ms"), it.holds(value)));

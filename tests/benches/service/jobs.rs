@@ -184,7 +184,9 @@ pub(crate) async fn status(
 
 /// Workers that lease and complete as fast as they can; cycles per second.
 pub(crate) async fn cycles(service: &Service, load: Load) -> Result<f64> {
-    let bundle = service.upload("bench/o0", b"a bundle's only file\n").await?;
+    let bundle = service
+        .upload("bench/o0", b"a bundle's only file\n")
+        .await?;
     let done = Arc::new(AtomicUsize::new(0));
     let mut workers = Vec::new();
     for number in 0..load.workers {
@@ -228,7 +230,9 @@ pub(crate) async fn cycles(service: &Service, load: Load) -> Result<f64> {
     let secs = begun.elapsed().as_secs_f64();
     let rate = done.load(Ordering::Relaxed) as f64 / secs;
     let busy = (service.cpu()? - cpu).as_secs_f64() / secs;
-    say(&format!("{rate:.0} cycles/s; the coordinator keeps {busy:.2} cores busy"));
+    say(&format!(
+        "{rate:.0} cycles/s; the coordinator keeps {busy:.2} cores busy"
+    ));
     Ok(rate)
 }
 
@@ -245,11 +249,7 @@ pub(crate) fn reports(figures: &mut Figures, service: &Service, store: &str) -> 
 }
 
 /// Workers that each hold a job and report about it, for two leases.
-pub(crate) async fn connected(
-    figures: &mut Figures,
-    service: &Service,
-    load: Load,
-) -> Result<()> {
+pub(crate) async fn connected(figures: &mut Figures, service: &Service, load: Load) -> Result<()> {
     fill(service, load.connected, "held").await?;
     let mut workers = Vec::new();
     for number in 0..load.connected {
@@ -261,51 +261,73 @@ pub(crate) async fn connected(
     }
     let (every, until) = (service.heartbeat(), Instant::now() + 2 * service.lease());
     let (cpu, begun) = (service.cpu()?, Instant::now());
-    let tasks = workers.into_iter().enumerate().map(|(index, (name, mut worker, lease))| {
-        let first = every * index as u32 / load.connected as u32;
-        tokio::spawn(async move {
-            let mut times = Vec::new();
-            tokio::time::sleep(first).await;
-            let mut tick = tokio::time::interval(every);
-            while Instant::now() < until {
-                tick.tick().await;
-                let seq = times.len() as u64 + 1;
-                let line = v1::LogLine {
-                    seq,
-                    level: "info".to_owned(),
-                    message: format!("step {seq} loss 0.0280"),
-                    ..v1::LogLine::default()
-                };
-                let progress = v1::Progress {
-                    stage: "effects".to_owned(),
-                    percent: seq as f64,
-                    ..v1::Progress::default()
-                };
-                let sent = Instant::now();
-                worker
-                    .heartbeat(v1::HeartbeatRequest {
-                        job: attempt(&lease, &name),
-                        progress: Some(progress),
-                        logs: vec![line],
-                    })
-                    .await?;
-                times.push(sent.elapsed());
-            }
-            anyhow::Ok(times)
-        })
-    });
+    let tasks = workers
+        .into_iter()
+        .enumerate()
+        .map(|(index, (name, mut worker, lease))| {
+            let first = every * index as u32 / load.connected as u32;
+            tokio::spawn(async move {
+                let mut times = Vec::new();
+                tokio::time::sleep(first).await;
+                let mut tick = tokio::time::interval(every);
+                while Instant::now() < until {
+                    tick.tick().await;
+                    let seq = times.len() as u64 + 1;
+                    let line = v1::LogLine {
+                        seq,
+                        level: "info".to_owned(),
+                        message: format!("step {seq} loss 0.0280"),
+                        ..v1::LogLine::default()
+                    };
+                    let progress = v1::Progress {
+                        stage: "effects".to_owned(),
+                        percent: seq as f64,
+                        ..v1::Progress::default()
+                    };
+                    let sent = Instant::now();
+                    worker
+                        .heartbeat(v1::HeartbeatRequest {
+                            job: attempt(&lease, &name),
+                            progress: Some(progress),
+                            logs: vec![line],
+                        })
+                        .await?;
+                    times.push(sent.elapsed());
+                }
+                anyhow::Ok(times)
+            })
+        });
     let mut times = Vec::new();
     for reported in try_join_all(tasks).await? {
         times.extend(reported.context("a worker lost its job")?);
     }
     let secs = begun.elapsed().as_secs_f64();
     let busy = (service.cpu()? - cpu).as_secs_f64() / secs;
-    let name = format!("{} workers that report every {} s", load.connected, every.as_secs());
+    let name = format!(
+        "{} workers that report every {} s",
+        load.connected,
+        every.as_secs()
+    );
     figures.p95_ms(&format!("{name}: answer"), &times, None);
-    figures.alone(&format!("{name}: coordinator's share of a core"), "%", &[busy * 100.0], None);
+    figures.alone(
+        &format!("{name}: coordinator's share of a core"),
+        "%",
+        &[busy * 100.0],
+        None,
+    );
     let lost = service.metric("ign_leases_reaped_total").await?;
-    figures.alone(&format!("{name}: leases lost"), "jobs", &[lost], Some(Target::AtMost(0.0)));
+    figures.alone(
+        &format!("{name}: leases lost"),
+        "jobs",
+        &[lost],
+        Some(Target::AtMost(0.0)),
+    );
     let (now, _) = service.memory()?;
-    figures.alone(&format!("{name}: coordinator's memory"), "MB", &[now / 1e6], None);
+    figures.alone(
+        &format!("{name}: coordinator's memory"),
+        "MB",
+        &[now / 1e6],
+        None,
+    );
     Ok(())
 }

@@ -23,7 +23,17 @@ pub(crate) fn rate(postgres: &Postgres, url: &str, clients: usize, secs: f64) ->
     let (clients, whole_secs) = (clients.to_string(), secs.ceil().to_string());
     let text = pgbench(
         postgres,
-        &["-n", "-N", "-j", "2", "-c", &clients, "-T", &whole_secs, url],
+        &[
+            "-n",
+            "-N",
+            "-j",
+            "2",
+            "-c",
+            &clients,
+            "-T",
+            &whole_secs,
+            url,
+        ],
         secs + 60.0,
     )?;
     text.lines()

@@ -101,7 +101,10 @@ impl Service {
             }
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
-        anyhow::bail!("the coordinator did not start: {}", service.coordinator.output())
+        anyhow::bail!(
+            "the coordinator did not start: {}",
+            service.coordinator.output()
+        )
     }
 
     pub(crate) fn url(&self) -> &str {
