@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use chrono::{DateTime, Utc};
 use futures::{StreamExt as _, TryStreamExt as _};
-use ign_capture::{Fault, Findings, PreflightOptions, Severity};
+use ign_capture::{Fault, Findings, Preflight, PreflightOptions, Severity};
 use ign_proto::{CollectionId, Digest, ObjectName, v1};
 use serde::Serialize;
 use tokio::sync::mpsc;
@@ -588,18 +588,39 @@ async fn dry_run(
 ) -> Result<(), Problem> {
     let total = orders.len();
     let at_once = std::thread::available_parallelism().map_or(2, usize::from);
-    let mut checking = futures::stream::iter(orders.into_iter().map(check)).buffered(at_once);
-    let mut checks = Vec::new();
-    while let Some(check) = checking.next().await {
-        let check = check?;
-        output::note(&format!(
-            "{}/{total}  checked {}",
-            checks.len() + 1,
-            check.path.display()
-        ));
-        errors.check(&check)?;
-        checks.push(check);
+    // Rows that name one capture share its check.
+    let mut captures: BTreeMap<_, Vec<usize>> = BTreeMap::new();
+    for (index, order) in orders.iter().enumerate() {
+        let recipe = &order.recipe;
+        let at = (order.capture.clone(), recipe.size, recipe.budget_secs);
+        captures.entry(at).or_default().push(index);
     }
+    let mut captures: Vec<_> = captures.into_iter().collect();
+    captures.sort_by_key(|(_, rows)| rows[0]);
+    let mut checking = futures::stream::iter(captures)
+        .map(|((capture, size, budget_secs), rows)| async move {
+            let options = PreflightOptions {
+                proxy: None,
+                size,
+                budget_secs: budget_secs.map(|secs| secs as f64),
+            };
+            Ok::<_, Problem>((rows, preflight::examine(capture, options).await?))
+        })
+        .buffered(at_once);
+    let mut checks: BTreeMap<usize, CheckView> = BTreeMap::new();
+    while let Some(checked) = checking.next().await {
+        let (rows, report) = checked?;
+        for row in rows {
+            let check = check_view(&orders[row], report.clone());
+            errors.check(&check)?;
+            checks.insert(row, check);
+            if total <= 100 || row % 100 == 0 {
+                let path = orders[row].capture.display();
+                output::note(&format!("{}/{total}  checked {path}", checks.len()));
+            }
+        }
+    }
+    let checks: Vec<CheckView> = checks.into_values().collect();
     output::data(context.format, &checks, || check_table(&checks))?;
     let bad = checks.iter().filter(|check| !check.ok).count();
     if bad > 0 {
@@ -610,16 +631,10 @@ async fn dry_run(
     Ok(())
 }
 
-async fn check(order: Order) -> Result<CheckView, Problem> {
-    let options = PreflightOptions {
-        proxy: None,
-        size: order.recipe.size,
-        budget_secs: order.recipe.budget_secs.map(|secs| secs as f64),
-    };
-    let report = preflight::examine(order.capture.clone(), options).await?;
+fn check_view(order: &Order, report: Preflight) -> CheckView {
     let counts = report.findings.as_ref().map(|findings| &findings.counts);
-    Ok(CheckView {
-        path: order.capture,
+    CheckView {
+        path: order.capture.clone(),
         collection: order.object.collection.to_string(),
         object: order.object.object.to_string(),
         ok: report.ok,
@@ -628,7 +643,7 @@ async fn check(order: Order) -> Result<CheckView, Problem> {
         triangles: counts.map(|counts| counts.triangles),
         faults: report.faults,
         findings: report.findings,
-    })
+    }
 }
 
 fn check_table(checks: &[CheckView]) -> String {

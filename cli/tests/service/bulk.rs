@@ -1,5 +1,6 @@
 //! Submitting much, again and again: nothing is sent twice.
 
+use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
@@ -221,7 +222,7 @@ fn rows_that_name_one_capture_send_it_once_and_become_a_job_each() {
     let mut list = String::from("path,collection,object\n");
     for row in 0..1200 {
         let name = ["vase", "bust"][row % 2];
-        list.push_str(&format!("{name},museum,{name}-{row}\n"));
+        writeln!(list, "{name},museum,{name}-{row}").unwrap();
     }
     let file = captures.path().join("list.csv");
     std::fs::write(&file, list).unwrap();

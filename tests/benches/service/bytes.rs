@@ -12,7 +12,7 @@ use tempfile::TempDir;
 
 use crate::Load;
 use crate::figures::Figures;
-use crate::service::{Service, await_line, text};
+use crate::service::{Service, TOKEN, await_line, text};
 
 const ACCESS_KEY: &str = "ign-bench-access";
 const SECRET_KEY: &str = "ign-bench-secret-0123456789";
@@ -128,7 +128,7 @@ pub(crate) async fn measure(figures: &mut Figures, load: Load) -> Result<()> {
     let capture = s3.dir.path().join("capture");
     fs::create_dir_all(capture.join("images"))?;
     let file = capture.join("mesh.ply");
-    let authorization = format!("Authorization: Bearer {}", on_s3.token());
+    let authorization = format!("Authorization: Bearer {TOKEN}");
     let (signed, keys) = (
         format!("aws:amz:{REGION}:s3"),
         format!("{ACCESS_KEY}:{SECRET_KEY}"),

@@ -13,7 +13,7 @@ use tokio::time::Instant;
 
 use crate::Load;
 use crate::figures::{Figures, Target, say};
-use crate::service::Service;
+use crate::service::{LEASE, Service};
 
 /// Rows of one `SubmitBatch`: its answer, a job each, must fit into a message.
 const ROWS_A_CALL: usize = 10_000;
@@ -50,12 +50,12 @@ fn lease_request(worker: &str, wait_secs: f64) -> v1::LeaseRequest {
     }
 }
 
-fn attempt(lease: &v1::Lease, worker: &str) -> Option<v1::JobAttempt> {
-    Some(v1::JobAttempt {
+fn attempt(lease: &v1::Lease, worker: &str) -> v1::JobAttempt {
+    v1::JobAttempt {
         job_id: lease.job_id.clone(),
         attempt: lease.attempt,
         worker_id: worker.to_owned(),
-    })
+    }
 }
 
 /// From the call that submits a job to the answer of a worker's long poll.
@@ -83,7 +83,7 @@ pub(crate) async fn pickup(figures: &mut Figures, service: &Service, store: &str
         };
         worker
             .fail(v1::FailRequest {
-                job: attempt(&lease, "w"),
+                job: Some(attempt(&lease, "w")),
                 failure: Some(failure),
                 logs: Vec::new(),
             })
@@ -98,7 +98,7 @@ pub(crate) async fn pickup(figures: &mut Figures, service: &Service, store: &str
 }
 
 /// Queues `rows` jobs of a thousand objects.
-async fn fill(service: &Service, rows: usize, prefix: &str) -> Result<Duration> {
+pub(crate) async fn fill(service: &Service, rows: usize, prefix: &str) -> Result<Duration> {
     let capture = service.capture("bench/o0").await?.to_string();
     let mut jobs = service.jobs()?;
     let begun = Instant::now();
@@ -213,7 +213,7 @@ pub(crate) async fn cycles(service: &Service, load: Load) -> Result<f64> {
                 };
                 worker
                     .complete(v1::CompleteRequest {
-                        job: attempt(&lease, &name),
+                        job: Some(attempt(&lease, &name)),
                         files: vec![(&file).into()],
                         metrics_json: r#"{"mse":4.9}"#.to_owned(),
                     })
@@ -229,7 +229,7 @@ pub(crate) async fn cycles(service: &Service, load: Load) -> Result<f64> {
     }
     let secs = begun.elapsed().as_secs_f64();
     let rate = done.load(Ordering::Relaxed) as f64 / secs;
-    let busy = (service.cpu()? - cpu).as_secs_f64() / secs;
+    let busy = service.cpu()?.saturating_sub(cpu).as_secs_f64() / secs;
     say(&format!(
         "{rate:.0} cycles/s; the coordinator keeps {busy:.2} cores busy"
     ));
@@ -259,7 +259,7 @@ pub(crate) async fn connected(figures: &mut Figures, service: &Service, load: Lo
         let lease = lease.lease.context("the queue is empty")?;
         workers.push((name, worker, lease));
     }
-    let (every, until) = (service.heartbeat(), Instant::now() + 2 * service.lease());
+    let (every, until) = (LEASE / 3, Instant::now() + 2 * LEASE);
     let (cpu, begun) = (service.cpu()?, Instant::now());
     let tasks = workers
         .into_iter()
@@ -287,7 +287,7 @@ pub(crate) async fn connected(figures: &mut Figures, service: &Service, load: Lo
                     let sent = Instant::now();
                     worker
                         .heartbeat(v1::HeartbeatRequest {
-                            job: attempt(&lease, &name),
+                            job: Some(attempt(&lease, &name)),
                             progress: Some(progress),
                             logs: vec![line],
                         })
@@ -302,7 +302,7 @@ pub(crate) async fn connected(figures: &mut Figures, service: &Service, load: Lo
         times.extend(reported.context("a worker lost its job")?);
     }
     let secs = begun.elapsed().as_secs_f64();
-    let busy = (service.cpu()? - cpu).as_secs_f64() / secs;
+    let busy = service.cpu()?.saturating_sub(cpu).as_secs_f64() / secs;
     let name = format!(
         "{} workers that report every {} s",
         load.connected,

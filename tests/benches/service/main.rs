@@ -74,19 +74,20 @@ async fn postgres(figures: &mut Figures, load: Load) -> Result<()> {
     let service = Service::start(&postgres.create_database()?).await?;
     jobs::submit(figures, &service, load, "Postgres").await?;
     jobs::status(figures, &service, load, "Postgres").await?;
+    let in_memory = Service::start_in_memory(&postgres.create_database()?).await?;
+    jobs::fill(&in_memory, load.rows, "row").await?;
     let peer = pgbench::prepare(&postgres)?;
-    let (mut cycles, mut transactions) = (Vec::new(), Vec::new());
+    let (mut transactions, mut on_disk, mut without_disk) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..load.rounds {
         transactions.push(pgbench::rate(&postgres, &peer, load.workers, load.secs)?);
-        cycles.push(jobs::cycles(&service, load).await?);
+        on_disk.push(jobs::cycles(&service, load).await?);
+        without_disk.push(jobs::cycles(&in_memory, load).await?);
     }
-    figures.beside(
-        &format!("lease and complete, {} workers, Postgres", load.workers),
-        "cycles/s",
-        &cycles,
-        ("pgbench -N", &transactions),
-        Some(0.5),
-    );
+    let name = format!("lease and complete, {} workers, Postgres", load.workers);
+    let peer = ("pgbench -N", &transactions[..]);
+    figures.beside(&name, "cycles/s", &on_disk, peer, Some(0.5));
+    let name = format!("{name}, bundles in memory");
+    figures.beside(&name, "cycles/s", &without_disk, peer, None);
     jobs::reports(figures, &service, "Postgres")
 }
 

@@ -18,9 +18,10 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Channel;
 use tonic::{Request, Status};
 
-const TOKEN: &str = "ign-bench-token-0123456789abcdef";
+/// The root token.
+pub(crate) const TOKEN: &str = "ign-bench-token-0123456789abcdef";
 /// A third of the default: workers report three times as often, and a lease that is lost shows three times as soon.
-const LEASE_SECS: u32 = 15;
+pub(crate) const LEASE: Duration = Duration::from_secs(15);
 /// Unit of times in `/proc`, on every Linux that runs this.
 const TICKS_PER_SEC: f64 = 100.0;
 
@@ -50,7 +51,18 @@ pub(crate) struct Service {
 impl Service {
     /// On this database, with bundles on the local disk.
     pub(crate) async fn start(database: &str) -> Result<Self> {
-        let dir = tempfile::Builder::new().prefix("ign-bench-").tempdir()?;
+        Self::start_in(&std::env::temp_dir(), database).await
+    }
+
+    /// On this database, with bundles in memory: what is left is the queue.
+    pub(crate) async fn start_in_memory(database: &str) -> Result<Self> {
+        Self::start_in(Path::new("/dev/shm"), database).await
+    }
+
+    async fn start_in(parent: &Path, database: &str) -> Result<Self> {
+        let dir = tempfile::Builder::new()
+            .prefix("ign-bench-")
+            .tempdir_in(parent)?;
         let store = format!("file://{}/store", dir.path().display());
         Self::launch(dir, database, &store, []).await
     }
@@ -78,7 +90,7 @@ impl Service {
                 "--token-file",
                 &token,
                 "--lease-secs",
-                &LEASE_SECS.to_string(),
+                &LEASE.as_secs().to_string(),
             ],
             env,
             &dir.path().join("coordinator.log"),
@@ -111,22 +123,8 @@ impl Service {
         &self.url
     }
 
-    pub(crate) fn token(&self) -> &'static str {
-        TOKEN
-    }
-
     pub(crate) fn folder(&self) -> &Path {
         self.dir.path()
-    }
-
-    /// How often a worker reports.
-    pub(crate) fn heartbeat(&self) -> Duration {
-        Duration::from_secs(u64::from(LEASE_SECS)) / 3
-    }
-
-    /// Length of a lease.
-    pub(crate) fn lease(&self) -> Duration {
-        Duration::from_secs(u64::from(LEASE_SECS))
     }
 
     fn authorized(&self) -> Result<Authorized> {
