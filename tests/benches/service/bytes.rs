@@ -156,7 +156,7 @@ pub(crate) async fn measure(figures: &mut Figures, load: Load) -> Result<()> {
             (&on_disk, &mut sent_disk, &mut got_disk),
         ] {
             let blobs = format!("{}/v2/bench/curl/blobs", service.url());
-            let post = format!("{blobs}/uploads/?digest={digest}");
+            let post = format!("{blobs}/uploads?digest={digest}");
             let get = format!("{blobs}/{digest}");
             sent.push(mib / curl(&["-H", &authorization, "-X", "POST", "-T", path, &post])?);
             got.push(mib / curl(&["-H", &authorization, &get])?);
