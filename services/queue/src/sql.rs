@@ -752,8 +752,13 @@ impl SqlStore {
                 answers.push(next.as_ref().map(|_| leased.len()));
                 if let Some(mut job) = next {
                     let attempt = job.attempt;
-                    job.lease(ask.worker.id.clone(), ask.holder.clone(), now, self.settings.lease)
-                        .map_err(|refusal| refused(&job, attempt, refusal))?;
+                    job.lease(
+                        ask.worker.id.clone(),
+                        ask.holder.clone(),
+                        now,
+                        self.settings.lease,
+                    )
+                    .map_err(|refusal| refused(&job, attempt, refusal))?;
                     leased.push(job);
                 }
             }
