@@ -17,7 +17,7 @@ use std::sync::Mutex;
 
 use futures::stream::{self, StreamExt as _};
 use ign_proto::{Attempt, JobId, Manifest, ObjectName};
-use ign_queue::{NewVersion, Version, VersionFilter};
+use ign_queue::{NewVersion, Standing, Version, VersionFilter};
 use ign_registry::{ObjectState, VersionRecord};
 
 use crate::app::App;
@@ -60,64 +60,80 @@ impl App {
             .publish_and_complete(job, attempt, bundle)
             .await?;
         ign_faults::point("publish.committed");
-        self.mirror(&version.object, Some(version.version)).await;
+        self.mirror(&version).await;
         Ok(version)
     }
 
-    /// Brings the bucket's copy of an object up to date, of one version or of all. A failure is logged and tried again
-    /// later: what the database committed stands.
-    pub(crate) async fn mirror(&self, object: &ObjectName, version: Option<u32>) {
-        if let Err(Refused(cause)) = self.try_mirror(object, version).await {
+    /// Brings the bucket's copy of a version and of its object up to date. A failure is logged and tried again later:
+    /// what the database committed stands.
+    pub(crate) async fn mirror(&self, version: &Version) {
+        self.mirror_object(&version.object, std::slice::from_ref(version))
+            .await;
+    }
+
+    async fn mirror_object(&self, object: &ObjectName, versions: &[Version]) {
+        if let Err(Refused(cause)) = self.try_mirror(object, versions).await {
             tracing::warn!(object = %object, error = %cause, "the bucket's record of versions is behind; trying again later");
             self.mirror.behind().insert(object.clone());
         }
     }
 
-    async fn try_mirror(&self, object: &ObjectName, only: Option<u32>) -> Result<(), Refused> {
-        let mut versions = self.store.versions_of(object).await?;
-        for version in versions
-            .iter()
-            .filter(|it| only.is_none_or(|only| it.version == only))
-        {
+    async fn try_mirror(&self, object: &ObjectName, versions: &[Version]) -> Result<(), Refused> {
+        for version in versions {
             self.registry.put_version(&record(version)).await?;
         }
+        let mut standing = self.store.standing(object).await?;
         loop {
-            let state = state(&versions);
-            self.registry.put_state(object, &state).await?;
-            versions = self.store.versions_of(object).await?;
-            if self::state(&versions) == state {
+            self.registry.put_state(object, &state(&standing)).await?;
+            let now = self.store.standing(object).await?;
+            if now == standing {
                 return Ok(());
             }
+            standing = now;
         }
     }
 
     /// Repairs the bucket's copy of every object.
     pub(crate) async fn mirror_all(&self) {
-        let all = VersionFilter {
-            include_retired: true,
-            ..VersionFilter::default()
-        };
-        let objects: BTreeSet<ObjectName> = match self.store.versions(&all).await {
-            Ok(versions) => versions.into_iter().map(|version| version.object).collect(),
-            Err(error) => {
-                let Refused(cause) = error.into();
-                tracing::warn!(error = %cause, "could not list versions to check the bucket's record of them");
-                return;
-            }
-        };
-        stream::iter(objects)
-            .for_each_concurrent(OBJECTS_IN_FLIGHT, |object| async move {
-                self.mirror(&object, None).await;
-            })
-            .await;
+        if let Err(Refused(cause)) = self.mirror_those(VersionFilter::default()).await {
+            tracing::warn!(error = %cause, "could not list versions to check the bucket's record of them");
+        }
     }
 
     /// Tries again what failed.
     pub(crate) async fn mirror_behind(&self) {
         let behind = std::mem::take(&mut *self.mirror.behind());
         for object in behind {
-            self.mirror(&object, None).await;
+            let of_object = VersionFilter {
+                collection: Some(object.collection.clone()),
+                object: Some(object.object.clone()),
+                ..VersionFilter::default()
+            };
+            if let Err(Refused(cause)) = self.mirror_those(of_object).await {
+                tracing::warn!(object = %object, error = %cause, "could not list an object's versions");
+                self.mirror.behind().insert(object);
+            }
         }
+    }
+
+    async fn mirror_those(&self, those: VersionFilter) -> Result<(), Refused> {
+        let all = VersionFilter {
+            include_retired: true,
+            ..those
+        };
+        let mut objects: BTreeMap<ObjectName, Vec<Version>> = BTreeMap::new();
+        for version in self.store.versions(&all).await? {
+            objects
+                .entry(version.object.clone())
+                .or_default()
+                .push(version);
+        }
+        stream::iter(objects)
+            .for_each_concurrent(OBJECTS_IN_FLIGHT, |(object, versions)| async move {
+                self.mirror_object(&object, &versions).await;
+            })
+            .await;
+        Ok(())
     }
 }
 
@@ -133,28 +149,15 @@ fn record(version: &Version) -> VersionRecord {
     }
 }
 
-fn state(versions: &[Version]) -> ObjectState {
-    let aliases: BTreeMap<String, u32> = versions
+fn state(standing: &Standing) -> ObjectState {
+    let retired_at = standing
+        .retired
         .iter()
-        .flat_map(|version| {
-            version
-                .aliases
-                .iter()
-                .map(|alias| (alias.clone(), version.version))
-        })
-        .collect();
-    let retired = versions
-        .iter()
-        .filter(|version| version.retired)
-        .map(|version| version.version)
-        .collect();
-    let retired_at = versions
-        .iter()
-        .filter_map(|version| Some((version.version, version.retired_at?)))
+        .filter_map(|(version, at)| Some((*version, (*at)?)))
         .collect();
     ObjectState {
-        aliases,
-        retired,
+        aliases: standing.aliases.clone(),
+        retired: standing.retired.keys().copied().collect(),
         retired_at,
     }
 }

@@ -51,14 +51,6 @@ pub(crate) fn shared(error: &StoreError) -> StoreError {
     }
 }
 
-/// An error for a call whose transaction was cut off before its end was known.
-pub(crate) fn cut_off() -> StoreError {
-    StoreError::Unavailable {
-        determinate: false,
-        source: sqlx::Error::WorkerCrashed,
-    }
-}
-
 /// An error while the schema was brought up to date.
 pub(crate) fn from_migration(error: sqlx::migrate::MigrateError) -> StoreError {
     match error {

@@ -3,6 +3,9 @@
 //! A commit costs a flush of the disk and as many round trips for one job as for thirty. The first of the calls that
 //! wait runs for all of them; nobody waits for company, so a call that comes alone is served at once. Groups come in
 //! powers of two: a statement's text depends on its number of rows, and so few texts stay prepared.
+//!
+//! A caller that leaves while it runs for others costs them a turn: they ask again. So only what may be asked twice is
+//! asked here, because the transaction may have been committed before the caller left.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -29,9 +32,22 @@ impl<Ask, Answer> Group<Ask, Answer> {
         }
     }
 
-    /// The answer to `ask`, from `run` called here or by another caller; it gives one answer for each. None when whoever
-    /// ran it was cut off in the middle.
-    pub(crate) async fn join<Run, Ran>(&self, ask: Ask, run: Run) -> Option<Answer>
+    /// The answer to `ask`, from `run` called here or by another caller; it gives one answer for each.
+    pub(crate) async fn join<Run, Ran>(&self, ask: Ask, run: Run) -> Answer
+    where
+        Ask: Clone,
+        Run: Fn(Vec<Ask>) -> Ran,
+        Ran: Future<Output = Vec<Answer>>,
+    {
+        loop {
+            if let Some(answer) = self.join_once(ask.clone(), &run).await {
+                return answer;
+            }
+        }
+    }
+
+    /// None when another caller ran it and left in the middle.
+    async fn join_once<Run, Ran>(&self, ask: Ask, run: &Run) -> Option<Answer>
     where
         Run: Fn(Vec<Ask>) -> Ran,
         Ran: Future<Output = Vec<Answer>>,
@@ -94,7 +110,7 @@ mod tests {
                         asks.into_iter().map(|ask| 2 * ask).collect()
                     }
                 };
-                assert_eq!(group.join(number, double).await, Some(2 * number));
+                assert_eq!(group.join(number, double).await, 2 * number);
             })
         });
         for call in calls.collect::<Vec<_>>() {
@@ -105,15 +121,30 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_caller_that_leaves_in_the_middle_answers_nobody_and_blocks_nobody() {
+    async fn a_caller_that_leaves_in_the_middle_costs_the_others_a_turn() {
         let group = Arc::new(Group::<u8, u8>::new(1));
-        let leaves = tokio::spawn({
+        let caller = |number: u8, runs: bool| {
             let group = group.clone();
-            async move { group.join(1, |_| std::future::pending()).await }
-        });
+            tokio::spawn(async move {
+                let run = |asks: Vec<u8>| async move {
+                    if !runs {
+                        std::future::pending::<()>().await;
+                    }
+                    asks
+                };
+                group.join(number, run).await
+            })
+        };
+        // The first has the only turn; the second will run for itself and the third, and never ends.
+        let first = caller(1, false);
         tokio::task::yield_now().await;
-        leaves.abort();
-        leaves.await.unwrap_err();
-        assert_eq!(group.join(2, |asks| async { asks }).await, Some(2));
+        let (second, third, fourth) = (caller(2, false), caller(3, true), caller(4, true));
+        tokio::task::yield_now().await;
+        for leaves in [first, second] {
+            leaves.abort();
+            leaves.await.unwrap_err();
+            tokio::task::yield_now().await;
+        }
+        assert_eq!((third.await.unwrap(), fourth.await.unwrap()), (3, 4));
     }
 }

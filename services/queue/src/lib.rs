@@ -29,8 +29,8 @@ pub use state::{
 };
 pub use store::{
     Adopted, Collection, Event, JobFilter, JobPage, LogLine, Named, NewLogLine, NewVersion, Orders,
-    Reaped, Settings, Status, Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker,
-    WorkerInfo,
+    Reaped, Settings, Standing, Status, Store, StoreError, Submit, Version, VersionFilter, Waiting,
+    Worker, WorkerInfo,
 };
 pub use token::{NewToken, SecretHash, Token, TokenKey, Tokens};
 pub use webhook::{Delivery, DeliveryState, Dispatch, Secret, Tried, Webhook, Webhooks};

@@ -24,13 +24,14 @@ use super::{
 };
 use crate::changes::{Change, Changes, Signal};
 use crate::check;
-use crate::error::{cut_off, from_commit, shared};
+use crate::error::{from_commit, shared};
 use crate::group::Group;
 use crate::state::{Checkpoint, Failure, Job, JobSpec, JobState, Level, Progress, Refusal};
 use crate::store::{
     Adopted, Collection, Event, JobFilter, JobPage, LogLine, MAX_EVENTS, MAX_LOG_LINE_BYTES,
     MAX_LOG_LINES, MAX_PAGE, Named, NewLogLine, NewVersion, Orders, Reaped, Result, Settings,
-    Status, Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker, WorkerInfo,
+    Standing, Status, Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker,
+    WorkerInfo,
 };
 use crate::token::{NewToken, SecretHash, Token, TokenKey, Tokens};
 use crate::waiting::{Rival, Surroundings, describe};
@@ -66,7 +67,7 @@ pub struct SqlStore {
     settings: Settings,
     leases: Group<LeaseAsk, Result<Option<Job>>>,
     publishes: Group<PublishAsk, Option<Result<Version>>>,
-    lookups: Group<ObjectName, Result<Vec<Version>>>,
+    lookups: Group<ObjectName, Result<Standing>>,
 }
 
 fn sql(text: String) -> AssertSqlSafe<String> {
@@ -359,6 +360,19 @@ fn level_from(word: &str) -> Result<Level> {
     }
 }
 
+/// The condition that a row is of one of these objects.
+fn push_objects<'a>(
+    query: &mut QueryBuilder<Db>,
+    objects: impl IntoIterator<Item = &'a ObjectName>,
+) {
+    query.push("(collection, object) in (");
+    query.push_values(objects, |mut row, object| {
+        row.push_bind(object.collection.as_str().to_owned())
+            .push_bind(object.object.as_str().to_owned());
+    });
+    query.push(")");
+}
+
 /// Starts a select of versions; the caller adds the condition.
 fn select_versions() -> QueryBuilder<Db> {
     QueryBuilder::new(format!(
@@ -572,7 +586,7 @@ impl SqlStore {
             transition(&mut job, now).map_err(|refusal| refused(&job, attempt, refusal))?;
             save_job(&mut transaction, &job).await?;
             if !had_ended {
-                announce(&mut transaction, &job, None, now).await?;
+                announce(&mut transaction, [(&job, None)], now).await?;
             }
             Ok(job)
         }
@@ -741,6 +755,8 @@ impl SqlStore {
         }
         let (mut transaction, now) = self.begin().await?;
         let outcome = async {
+            lock_limited(&mut transaction, &mut queues).await?;
+            queues.retain(|queue| queue.room > 0);
             let (mut leased, mut answers) = (Vec::new(), Vec::new());
             for (index, ask) in asks.iter().enumerate() {
                 if !served(ask, &queues) {
@@ -763,6 +779,7 @@ impl SqlStore {
                 }
             }
             save_jobs(&mut transaction, &leased).await?;
+            note_served(&mut transaction, &leased, now).await?;
             Ok((leased, answers))
         }
         .await;
@@ -851,9 +868,8 @@ impl SqlStore {
                 let latest = newest.iter().map(|(object, version)| (*object, *version));
                 point_aliases(&mut transaction, LATEST, latest).await?;
                 save_jobs(&mut transaction, &ended).await?;
-                for (job, version) in ended.iter().zip(&versions) {
-                    announce(&mut transaction, job, Some(&version.bundle), now).await?;
-                }
+                let bundles = versions.iter().map(|version| Some(&version.bundle));
+                announce(&mut transaction, ended.iter().zip(bundles), now).await?;
                 for version in &mut versions {
                     if last.get(&version.object) == Some(&version.version) {
                         version.aliases.push(LATEST.to_owned());
@@ -869,22 +885,26 @@ impl SqlStore {
         self.finish(transaction, outcome, Change::Work).await
     }
 
-    /// The versions of each of several objects.
-    async fn versions_of_all(&self, objects: &[ObjectName]) -> Result<Vec<Vec<Version>>> {
-        let mut query = select_versions();
-        query.push(" and (v.collection, v.object) in (");
-        query.push_values(objects, |mut row, object| {
-            row.push_bind(object.collection.as_str())
-                .push_bind(object.object.as_str());
-        });
-        query.push(") order by v.version");
-        let mut found: BTreeMap<ObjectName, Vec<Version>> = BTreeMap::new();
+    /// What may change of each of several objects.
+    async fn standings(&self, objects: &[ObjectName]) -> Result<Vec<Standing>> {
+        let mut query = QueryBuilder::<Db>::new(
+            "select collection, object, alias, version, null as retired_at from aliases where ",
+        );
+        push_objects(&mut query, objects);
+        query.push(
+            " union all select collection, object, null, version, retired_at from versions where retired and ",
+        );
+        push_objects(&mut query, objects);
+        let mut found: BTreeMap<ObjectName, Standing> = BTreeMap::new();
         for row in query.build().fetch_all(self.backend.reader()).await? {
-            let version = version_from(&row)?;
-            found
-                .entry(version.object.clone())
-                .or_default()
-                .push(version);
+            let standing = found.entry(object_name(&row)?).or_default();
+            let version = small(row.try_get("version")?)?;
+            if let Some(alias) = row.try_get::<Option<String>, _>("alias")? {
+                standing.aliases.insert(alias, version);
+            } else {
+                let retired_at = optional_time(&row, "retired_at")?;
+                standing.retired.insert(version, retired_at);
+            }
         }
         let of = |object| found.get(object).cloned().unwrap_or_default();
         Ok(objects.iter().map(of).collect())
@@ -904,9 +924,9 @@ impl SqlStore {
             let mut jobs = jobs_from(&rows)?;
             for job in &mut jobs {
                 job.expire(now);
-                announce(&mut transaction, job, None, now).await?;
             }
             save_jobs(&mut transaction, &jobs).await?;
+            announce(&mut transaction, jobs.iter().map(|job| (job, None)), now).await?;
             sqlx::query("delete from workers where last_seen_at < $1")
                 .bind(to_db(now - seconds(WORKER_KEPT_SECS)))
                 .execute(&mut *transaction)
@@ -922,8 +942,8 @@ impl SqlStore {
     }
 }
 
-/// A worker that asks for a job.
-#[derive(Debug)]
+/// A worker that asks for a job. Asked twice it may get a second one; the first one's lease then runs out.
+#[derive(Clone, Debug)]
 struct LeaseAsk {
     worker: WorkerInfo,
     holder: Option<String>,
@@ -953,6 +973,8 @@ struct Queue {
     collection: Collection,
     running: u64,
     served_at: Option<DateTime<Utc>>,
+    /// How many more jobs it may run.
+    room: u64,
     /// Priority, age and id of its next job.
     head: (i64, DateTime<Utc>, JobId),
     /// Its next jobs, once their rows are locked.
@@ -996,8 +1018,7 @@ async fn waiting_queues(reader: &mut Connection, now: DateTime<Utc>) -> Result<V
     };
     let rows = sqlx::query(sql(format!(
         "select c.*, {}, {}, {}, \
-         (select count(*) from jobs r where r.collection = c.name and r.state = 'leased') as running, \
-         (select max(s.started_at) from jobs s where s.collection = c.name and s.started_at is not null) as served_at \
+         (select count(*) from jobs r where r.collection = c.name and r.state = 'leased') as running \
          from collections c where not c.paused",
         head("priority"),
         head("submitted_at"),
@@ -1011,9 +1032,11 @@ async fn waiting_queues(reader: &mut Connection, now: DateTime<Utc>) -> Result<V
         let Some(priority) = row.try_get::<Option<i64>, _>("priority")? else {
             continue;
         };
+        let (collection, running) = (collection_from(&row)?, count(row.try_get("running")?));
         let queue = Queue {
-            collection: collection_from(&row)?,
-            running: count(row.try_get("running")?),
+            room: room(&collection, running),
+            collection,
+            running,
             served_at: optional_time(&row, "served_at")?,
             head: (
                 priority,
@@ -1022,12 +1045,61 @@ async fn waiting_queues(reader: &mut Connection, now: DateTime<Utc>) -> Result<V
             ),
             locked: None,
         };
-        let limit = u64::from(queue.collection.max_running);
-        if limit == 0 || queue.running < limit {
+        if queue.room > 0 {
             queues.push(queue);
         }
     }
     Ok(queues)
+}
+
+/// How many more jobs a collection may run.
+fn room(settings: &Collection, running: u64) -> u64 {
+    match (settings.paused, settings.max_running) {
+        (true, _) => 0,
+        (false, 0) => u64::MAX,
+        (false, limit) => u64::from(limit).saturating_sub(running),
+    }
+}
+
+/// Locks the rows of collections that have a limit, all of them before any job and in the order of their names, and looks
+/// again how much room there is: two claims must not both take the last place. The others are not held up.
+async fn lock_limited(connection: &mut Connection, queues: &mut [Queue]) -> Result<()> {
+    let mut limited: BTreeMap<CollectionId, &mut Queue> = queues
+        .iter_mut()
+        .filter(|queue| queue.collection.max_running > 0)
+        .map(|queue| (queue.collection.name.clone(), queue))
+        .collect();
+    if limited.is_empty() {
+        return Ok(());
+    }
+    let mut select = QueryBuilder::<Db>::new("select * from collections where name in (");
+    let mut names = select.separated(", ");
+    for name in limited.keys() {
+        names.push_bind(name.as_str());
+    }
+    select.push(") order by name ").push(LOCK);
+    let rows = select.build().fetch_all(&mut *connection).await?;
+    let mut select = QueryBuilder::<Db>::new(
+        "select collection, count(*) as running from jobs where state = 'leased' and collection in (",
+    );
+    let mut names = select.separated(", ");
+    for name in limited.keys() {
+        names.push_bind(name.as_str());
+    }
+    select.push(") group by collection");
+    let mut running: BTreeMap<CollectionId, u64> = BTreeMap::new();
+    for row in select.build().fetch_all(connection).await? {
+        let name = parse(row.try_get("collection")?)?;
+        running.insert(name, count(row.try_get("running")?));
+    }
+    for row in rows {
+        let settings = collection_from(&row)?;
+        if let Some(queue) = limited.get_mut(&settings.name) {
+            queue.running = running.get(&settings.name).copied().unwrap_or(0);
+            queue.room = room(&settings, queue.running);
+        }
+    }
+    Ok(())
 }
 
 /// The next job for a worker, its row locked; `at_most` jobs are wanted in this transaction from now on. A queue from
@@ -1046,8 +1118,7 @@ async fn next_job(
         let Some(at) = first else { return Ok(None) };
         let queue = &mut queues[at];
         let Some(jobs) = &mut queue.locked else {
-            let name = &queue.collection.name;
-            let room = room(connection, name).await?.min(at_most as u64);
+            let (name, room) = (&queue.collection.name, queue.room.min(at_most as u64));
             queue.locked = Some(lock_queued(connection, name, room, now).await?);
             queue.take_head();
             continue;
@@ -1061,6 +1132,27 @@ async fn next_job(
         queue.take_head();
         return Ok(Some(job));
     }
+}
+
+/// Notes that jobs of these collections were leased now, except where somebody else is about to do the same.
+async fn note_served(connection: &mut Connection, jobs: &[Job], now: DateTime<Utc>) -> Result<()> {
+    let collections: BTreeSet<&str> = jobs
+        .iter()
+        .map(|job| job.spec.object.collection.as_str())
+        .collect();
+    if collections.is_empty() {
+        return Ok(());
+    }
+    let mut update = QueryBuilder::<Db>::new("update collections set served_at = ");
+    update.push_bind(to_db(now));
+    update.push(" where name in (select name from collections where name in (");
+    let mut names = update.separated(", ");
+    for name in collections {
+        names.push_bind(name);
+    }
+    update.push(") order by name ").push(LOCK_FREE_ROWS);
+    update.push(")").build().execute(connection).await?;
+    Ok(())
 }
 
 /// The first jobs of a collection that nobody else is about to take.
@@ -1099,14 +1191,16 @@ async fn lock_jobs(
     Ok(jobs.into_iter().map(|job| (job.id, job)).collect())
 }
 
-/// The newest version numbers of objects, their rows made where they are missing and locked until the transaction ends.
+/// The newest version numbers of objects, their rows locked until the transaction ends and made where they are missing.
 async fn lock_objects(
     connection: &mut Connection,
-    objects: BTreeSet<&ObjectName>,
+    mut objects: BTreeSet<&ObjectName>,
     lock: &str,
 ) -> Result<BTreeMap<ObjectName, u32>> {
+    let mut last = lock_known_objects(connection, &objects, lock).await?;
+    objects.retain(|object| !last.contains_key(*object));
     if objects.is_empty() {
-        return Ok(BTreeMap::new());
+        return Ok(last);
     }
     let mut insert =
         QueryBuilder::<Db>::new("insert into objects (collection, object, last_version) ");
@@ -1115,18 +1209,27 @@ async fn lock_objects(
             .push_bind(object.object.as_str())
             .push("0");
     });
-    insert
-        .push(" on conflict (collection, object) do nothing")
-        .build()
-        .execute(&mut *connection)
-        .await?;
-    let mut select =
-        QueryBuilder::<Db>::new("select * from objects where (collection, object) in (");
-    select.push_values(&objects, |mut row, object| {
-        row.push_bind(object.collection.as_str())
-            .push_bind(object.object.as_str());
-    });
-    select.push(") order by collection, object ").push(lock);
+    insert.push(" on conflict (collection, object) do nothing returning collection, object");
+    for row in insert.build().fetch_all(&mut *connection).await? {
+        last.insert(object_name(&row)?, 0);
+    }
+    objects.retain(|object| !last.contains_key(*object));
+    // Others made them meanwhile, or hold them.
+    last.extend(lock_known_objects(connection, &objects, lock).await?);
+    Ok(last)
+}
+
+async fn lock_known_objects(
+    connection: &mut Connection,
+    objects: &BTreeSet<&ObjectName>,
+    lock: &str,
+) -> Result<BTreeMap<ObjectName, u32>> {
+    if objects.is_empty() {
+        return Ok(BTreeMap::new());
+    }
+    let mut select = QueryBuilder::<Db>::new("select * from objects where ");
+    push_objects(&mut select, objects.iter().copied());
+    select.push(" order by collection, object ").push(lock);
     let rows = select.build().fetch_all(connection).await?;
     rows.iter()
         .map(|row| Ok((object_name(row)?, small(row.try_get("last_version")?)?)))
@@ -1150,39 +1253,6 @@ async fn advance_objects(
         .execute(connection)
         .await?;
     Ok(())
-}
-
-/// How many more jobs the collection may run. Where it has a limit its row is locked, so that two claims do not both
-/// take the last place; others are not held up.
-async fn room(connection: &mut Connection, collection: &CollectionId) -> Result<u64> {
-    let row = sqlx::query("select * from collections where name = $1")
-        .bind(collection.as_str())
-        .fetch_one(&mut *connection)
-        .await?;
-    let settings = collection_from(&row)?;
-    if settings.paused {
-        return Ok(0);
-    }
-    if settings.max_running == 0 {
-        return Ok(u64::MAX);
-    }
-    let row = sqlx::query(sql(format!(
-        "select * from collections where name = $1 {LOCK}"
-    )))
-    .bind(collection.as_str())
-    .fetch_one(&mut *connection)
-    .await?;
-    let settings = collection_from(&row)?;
-    let running: i64 =
-        sqlx::query_scalar("select count(*) from jobs where collection = $1 and state = 'leased'")
-            .bind(collection.as_str())
-            .fetch_one(connection)
-            .await?;
-    Ok(match (settings.paused, settings.max_running) {
-        (true, _) => 0,
-        (false, 0) => u64::MAX,
-        (false, limit) => u64::from(limit).saturating_sub(count(running)),
-    })
 }
 
 /// A collection and how many jobs wait in it.
@@ -1301,23 +1371,27 @@ fn worker_from(row: &DbRow) -> Result<WorkerInfo> {
 }
 
 async fn list_workers(connection: &mut Connection, now: DateTime<Utc>) -> Result<Vec<Worker>> {
-    let rows = sqlx::query(
-        "select w.*, (select j.id from jobs j where j.worker = w.id and j.state = 'leased' \
-         order by j.started_at desc limit 1) as job_id from workers w where w.last_seen_at > $1 order by w.id",
-    )
-    .bind(to_db(now - seconds(WORKER_LISTED_SECS)))
-    .fetch_all(connection)
-    .await?;
+    let rows =
+        sqlx::query("select worker, id from jobs where state = 'leased' order by started_at")
+            .fetch_all(&mut *connection)
+            .await?;
+    let mut running = BTreeMap::new();
+    for row in rows {
+        let worker: Option<String> = row.try_get("worker")?;
+        running.insert(worker, from_key(row.try_get("id")?)?);
+    }
+    let rows = sqlx::query("select * from workers where last_seen_at > $1 order by id")
+        .bind(to_db(now - seconds(WORKER_LISTED_SECS)))
+        .fetch_all(connection)
+        .await?;
     rows.iter()
         .map(|row| {
+            let info = worker_from(row)?;
             Ok(Worker {
-                info: worker_from(row)?,
                 last_seen_at: time(row, "last_seen_at")?,
-                job: row
-                    .try_get::<Option<_>, _>("job_id")?
-                    .map(from_key)
-                    .transpose()?,
+                job: running.get(&Some(info.id.to_string())).copied(),
                 draining: row.try_get("draining")?,
+                info,
             })
         })
         .collect()
@@ -1619,8 +1693,7 @@ impl Store for SqlStore {
                 Err(error) => asks.iter().map(|_| Err(shared(&error))).collect(),
             }
         };
-        let leased = self.leases.join(ask, run).await;
-        leased.unwrap_or_else(|| Err(cut_off()))
+        self.leases.join(ask, run).await
     }
 
     async fn heartbeat(
@@ -1695,20 +1768,17 @@ impl Store for SqlStore {
                 Err(_) => asks.iter().map(|_| None).collect(),
             }
         };
-        match self.publishes.join(ask.clone(), run).await {
-            None => Err(cut_off()),
-            Some(Some(published)) => published,
-            // Not with the others: it waits for what they passed over.
-            Some(None) => {
-                let mut alone = self.publish_all(&[ask], LOCK).await?;
-                alone.pop().flatten().unwrap_or_else(|| {
-                    Err(StoreError::NotFound {
-                        kind: "job",
-                        name: job.to_string(),
-                    })
-                })
-            }
+        if let Some(published) = self.publishes.join(ask.clone(), run).await {
+            return published;
         }
+        // Not with the others: it waits for what they passed over.
+        let mut alone = self.publish_all(&[ask], LOCK).await?;
+        alone.pop().flatten().unwrap_or_else(|| {
+            Err(StoreError::NotFound {
+                kind: "job",
+                name: job.to_string(),
+            })
+        })
     }
 
     async fn fail(
@@ -1730,7 +1800,7 @@ impl Store for SqlStore {
                 )
                 .map_err(|refusal| refused(&job, attempt, refusal))?;
             save_job(&mut transaction, &job).await?;
-            announce(&mut transaction, &job, None, now).await?;
+            announce(&mut transaction, [(&job, None)], now).await?;
             append_logs(&mut transaction, job.id, attempt, logs).await?;
             Ok(will_retry)
         }
@@ -1802,15 +1872,14 @@ impl Store for SqlStore {
         Ok(versions)
     }
 
-    async fn versions_of(&self, object: &ObjectName) -> Result<Vec<Version>> {
+    async fn standing(&self, object: &ObjectName) -> Result<Standing> {
         let run = |objects: Vec<ObjectName>| async move {
-            match self.versions_of_all(&objects).await {
-                Ok(versions) => versions.into_iter().map(Ok).collect(),
+            match self.standings(&objects).await {
+                Ok(standings) => standings.into_iter().map(Ok).collect(),
                 Err(error) => objects.iter().map(|_| Err(shared(&error))).collect(),
             }
         };
-        let found = self.lookups.join(object.clone(), run).await;
-        found.unwrap_or_else(|| Err(cut_off()))
+        self.lookups.join(object.clone(), run).await
     }
 
     async fn version(&self, object: &ObjectName, reference: &str) -> Result<Version> {

@@ -250,6 +250,15 @@ pub struct Version {
     pub retired_at: Option<DateTime<Utc>>,
 }
 
+/// What of an object's versions may change; all else of a version stays as it was published.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Standing {
+    /// Alias to version.
+    pub aliases: BTreeMap<String, u32>,
+    /// Versions taken out of listings, and since when, where that is known.
+    pub retired: BTreeMap<u32, Option<DateTime<Utc>>>,
+}
+
 /// What [`Store::adopt`] did.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Adopted {
@@ -468,8 +477,8 @@ pub trait Store: Tokens + Webhooks + Send + Sync + std::fmt::Debug + 'static {
     /// Published bundles by collection, object and version.
     async fn versions(&self, filter: &VersionFilter) -> Result<Vec<Version>>;
 
-    /// All bundles of one object by version, retired ones too.
-    async fn versions_of(&self, object: &ObjectName) -> Result<Vec<Version>>;
+    /// What of an object's versions may change.
+    async fn standing(&self, object: &ObjectName) -> Result<Standing>;
 
     /// One bundle by version (`v3`), alias (`latest`) or manifest digest; empty means `latest`.
     async fn version(&self, object: &ObjectName, reference: &str) -> Result<Version>;

@@ -5,9 +5,9 @@ use std::time::Duration;
 use async_trait::async_trait;
 use chrono::{DateTime, Utc};
 use ign_proto::{Attempt, CollectionId};
-use sqlx::Row;
+use sqlx::{QueryBuilder, Row};
 
-use super::super::{Connection, LOCK, LOCK_FREE_ROWS, from_key, key, to_db};
+use super::super::{Connection, Db, LOCK, LOCK_FREE_ROWS, from_key, key, to_db};
 use super::{DbRow, SqlStore, optional_time, parse, small, sql, time};
 use crate::changes::Change;
 use crate::check;
@@ -42,30 +42,49 @@ fn absent(id: &str) -> StoreError {
     }
 }
 
-/// Writes into the outbox that a job has ended, where its collection wants to hear of it.
-pub(super) async fn announce(
+/// Writes into the outbox which of `jobs` have ended, with their bundles, where their collections want to hear of it.
+pub(super) async fn announce<'a>(
     connection: &mut Connection,
-    job: &Job,
-    bundle: Option<&NewVersion>,
+    jobs: impl IntoIterator<Item = (&'a Job, Option<&'a NewVersion>)>,
     now: DateTime<Utc>,
 ) -> Result<()> {
-    let Some((event, body)) = event(job, bundle) else {
+    let ended: Vec<_> = jobs
+        .into_iter()
+        .filter(|(job, _)| job.state.is_terminal())
+        .collect();
+    if ended.is_empty() {
         return Ok(());
+    }
+    let listening: Vec<String> = sqlx::query_scalar("select collection from webhooks")
+        .fetch_all(&mut *connection)
+        .await?;
+    let told = |(job, bundle): (&'a Job, _)| {
+        let collection = job.spec.object.collection.as_str();
+        let listens = listening.iter().any(|it| it == collection);
+        Some((job, listens.then(|| event(job, bundle))??))
     };
-    sqlx::query(
+    let events: Vec<(&Job, (&str, String))> = ended.into_iter().filter_map(told).collect();
+    if events.is_empty() {
+        return Ok(());
+    }
+    let mut insert = QueryBuilder::<Db>::new(
         "insert into deliveries (id, collection, job_id, attempt, event, body, state, created_at, next_at) \
-         select $1, w.collection, $2, $3, $4, $5, 'pending', $6, $6 from webhooks w where w.collection = $7 \
-         on conflict do nothing",
-    )
-    .bind(format!("msg_{}", uuid::Uuid::now_v7().simple()))
-    .bind(key(job.id))
-    .bind(i64::from(job.attempt.0))
-    .bind(event)
-    .bind(body)
-    .bind(to_db(now))
-    .bind(job.spec.object.collection.as_str())
-    .execute(connection)
-    .await?;
+         select v.column1, v.column2, v.column3, v.column4, v.column5, v.column6, 'pending', v.column7, v.column7 from (",
+    );
+    insert.push_values(events, |mut row, (job, (event, body))| {
+        row.push_bind(format!("msg_{}", uuid::Uuid::now_v7().simple()))
+            .push_bind(job.spec.object.collection.as_str())
+            .push_bind(key(job.id))
+            .push_bind(i64::from(job.attempt.0))
+            .push_bind(event)
+            .push_bind(body)
+            .push_bind(to_db(now));
+    });
+    insert
+        .push(") v, webhooks w where w.collection = v.column2 on conflict do nothing")
+        .build()
+        .execute(connection)
+        .await?;
     Ok(())
 }
 

@@ -9,7 +9,7 @@ static FOR_POSTGRES: Migrator = sqlx::migrate!("../../migrations/postgres");
 static FOR_SQLITE: Migrator = sqlx::migrate!("../../migrations/sqlite");
 
 /// The last step.
-const NEWEST: i64 = 23;
+const NEWEST: i64 = 24;
 
 /// Columns of the first schema, in every table.
 const FIRST: [(&str, &str); 7] = [

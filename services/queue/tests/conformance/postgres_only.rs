@@ -1,13 +1,15 @@
 //! What takes a server: several coordinators on one database, and a server that goes away.
 
 use std::collections::BTreeSet;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use ign_queue::{Settings, StoreError};
+use ign_proto::CollectionId;
+use ign_queue::{Collection, FailureKind, Settings, StoreError};
 use ign_testkit::Postgres;
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 
-use crate::bench::{Bench, PATIENT, request, worker};
+use crate::bench::{Bench, PATIENT, failure, request, worker};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_stores_lease_each_job_once() {
@@ -39,6 +41,46 @@ async fn two_stores_lease_each_job_once() {
     let all: Vec<_> = tasks.join_all().await.into_iter().flatten().collect();
     assert_eq!(all.len(), 60);
     assert_eq!(all.into_iter().collect::<BTreeSet<_>>().len(), 60);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn two_stores_that_lease_from_limited_collections_never_wait_for_each_other_in_a_ring() {
+    const JOBS: usize = 150;
+    let bench = Bench::postgres().await;
+    let stores = [bench.store.clone(), bench.open(PATIENT).await];
+    let names = ["library", "museum"].map(|name| name.parse::<CollectionId>().unwrap());
+    for name in &names {
+        let mut collection = Collection::new(name.clone());
+        collection.max_running = 6;
+        bench.store.set_collection(collection).await.unwrap();
+        let requests = (0..JOBS).map(|_| request(&format!("{name}/vase")));
+        for submitted in bench.store.submit_batch(requests.collect()).await.unwrap() {
+            submitted.unwrap();
+        }
+    }
+    let left = std::sync::Arc::new(AtomicUsize::new(2 * JOBS));
+    let mut tasks = tokio::task::JoinSet::new();
+    for index in 0..32 {
+        // Each store asks now for the one, now for the other, in the same transaction too.
+        let store = stores[index % 2].clone();
+        let within = BTreeSet::from([names[index / 2 % 2].clone()]);
+        let left = left.clone();
+        tasks.spawn(async move {
+            let me = worker(&format!("w{index}"));
+            while left.load(Ordering::Relaxed) > 0 {
+                let leased = store.lease_within(&me, None, Some(&within)).await;
+                let Some(job) = leased.expect("no claim is a victim") else {
+                    tokio::time::sleep(Duration::from_millis(1)).await;
+                    continue;
+                };
+                let failure = failure(FailureKind::InvalidInput);
+                let ended = store.fail(job.id, job.attempt, failure, Vec::new()).await;
+                assert!(!ended.unwrap());
+                left.fetch_sub(1, Ordering::Relaxed);
+            }
+        });
+    }
+    tasks.join_all().await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
