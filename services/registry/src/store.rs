@@ -14,6 +14,7 @@ use object_store::{ObjectStore, ObjectStoreExt as _, PutMode, RetryConfig};
 use uuid::Uuid;
 
 use crate::error::{RegistryError, store_error};
+use crate::journal::Journal;
 
 /// Address of an object store.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -33,6 +34,10 @@ impl StoreConfig {
             options: Vec::new(),
         }
     }
+
+    fn folder(&self) -> Option<&str> {
+        self.url.strip_prefix("file://")
+    }
 }
 
 /// What the store was found to do at start.
@@ -50,13 +55,20 @@ pub struct Registry {
     pub(crate) store: Arc<dyn ObjectStore>,
     signer: Option<Arc<dyn Signer>>,
     prefix: Path,
+    /// Of a folder that is open for writing.
+    pub(crate) journal: Option<Arc<Journal>>,
     probe: Probe,
 }
 
 impl Registry {
     /// Opens the store, checks that it can be written and read, and finds out what it can do.
     pub async fn open(config: &StoreConfig) -> Result<Self, RegistryError> {
-        let registry = Self::connect(config)?.prepared().await?;
+        let mut registry = Self::connect(config)?;
+        if let Some(folder) = config.folder() {
+            let journal = Journal::open(folder.into()).await;
+            registry.journal = Some(journal.map_err(store_error("open", &Path::from("journal")))?);
+        }
+        let registry = registry.prepared().await?;
         if !registry.probe.conditional_create {
             tracing::warn!(
                 store.url = config.url,
@@ -126,6 +138,7 @@ impl Registry {
             },
             signer,
             prefix,
+            journal: None,
         }
     }
 
