@@ -277,6 +277,7 @@ mod tests {
                 nanos: 0,
             }),
             next_queued: vec![samples::queued()],
+            lease_secs: 45.0,
         }
     }
 

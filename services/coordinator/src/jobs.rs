@@ -393,6 +393,7 @@ impl Jobs for JobsApi {
             server_version: env!("CARGO_PKG_VERSION").to_owned(),
             at: Some(to_timestamp(status.at)),
             next_queued: self.0.full_jobs(&status.next_queued).await?,
+            lease_secs: self.0.store.settings().lease.as_secs_f64(),
         }))
     }
 }
