@@ -18,6 +18,8 @@ use crate::views::time;
 
 /// Less free space than this is worth a warning: one bake's work folder and bundle.
 const FREE_BYTES: u64 = 2_000_000_000;
+/// What a coordinator grants by default, where it does not say.
+const LEASE_SECS: f64 = 45.0;
 /// For the worker to start.
 const WORKER_LIMIT: Duration = Duration::from_secs(30);
 /// For torch to compute something; loading the GPU's library for the first time reads gigabytes.
@@ -189,22 +191,7 @@ async fn coordinator(connection: &Connection) -> Vec<Check> {
         )
         .hint("install the same version on both sides")
     });
-    let others: Vec<String> = status
-        .workers
-        .iter()
-        .filter(|worker| worker.version != status.server_version)
-        .map(|worker| format!("{} {}", worker.id, worker.version))
-        .collect();
-    checks.push(match (status.workers.len(), others.as_slice()) {
-        (0, _) => Check::new("workers", "warn", "none is connected")
-            .hint("ignctl up --workers N, or ign-worker agent on other machines"),
-        (count, []) => Check::new("workers", "ok", format!("{count} connected")),
-        (_, others) => Check::new(
-            "workers",
-            "warn",
-            format!("of another version: {}", others.join(", ")),
-        ),
-    });
+    checks.push(workers(&status));
     if let Some(at) = time(status.at.as_ref()) {
         let here = Utc::now() - chrono::Duration::from_std(half_way).unwrap_or_default();
         let skew = (at - here).num_milliseconds() as f64 / 1000.0;
@@ -224,6 +211,40 @@ async fn coordinator(connection: &Connection) -> Vec<Check> {
         });
     }
     checks
+}
+
+/// The workers that were seen within a lease.
+fn workers(status: &v1::StatusResponse) -> Check {
+    let lease_secs = if status.lease_secs > 0.0 {
+        status.lease_secs
+    } else {
+        LEASE_SECS
+    };
+    let at = time(status.at.as_ref());
+    let is_here = |worker: &&v1::Worker| {
+        let silent = at.zip(time(worker.last_seen_at.as_ref()));
+        silent.is_none_or(|(at, seen)| (at - seen).as_seconds_f64() <= lease_secs)
+    };
+    let here: Vec<&v1::Worker> = status.workers.iter().filter(is_here).collect();
+    let away = match status.workers.len() - here.len() {
+        0 => String::new(),
+        away => format!("; {away} not seen for {lease_secs:.0} s"),
+    };
+    let others: Vec<String> = here
+        .iter()
+        .filter(|worker| worker.version != status.server_version)
+        .map(|worker| format!("{} {}", worker.id, worker.version))
+        .collect();
+    match (here.len(), others.as_slice()) {
+        (0, _) => Check::new("workers", "warn", format!("none is connected{away}"))
+            .hint("ignctl up --workers N, or ign-worker agent on other machines"),
+        (count, []) => Check::new("workers", "ok", format!("{count} connected{away}")),
+        (_, others) => Check::new(
+            "workers",
+            "warn",
+            format!("of another version: {}{away}", others.join(", ")),
+        ),
+    }
 }
 
 fn writable(data: &Path) -> Check {
@@ -349,5 +370,43 @@ mod tests {
             .hint("run `make setup`"),
         ];
         insta::assert_snapshot!(table(&checks));
+    }
+
+    #[test]
+    fn a_worker_that_was_not_seen_for_a_lease_is_away() {
+        let seen = |secs: i64| v1::Worker {
+            id: format!("seen-at-{secs}"),
+            version: "1".to_owned(),
+            last_seen_at: Some(prost_types::Timestamp {
+                seconds: secs,
+                nanos: 0,
+            }),
+            ..v1::Worker::default()
+        };
+        let at = |seconds: i64, lease_secs: f64| {
+            let status = v1::StatusResponse {
+                workers: vec![seen(100), seen(1000)],
+                server_version: "1".to_owned(),
+                at: Some(prost_types::Timestamp { seconds, nanos: 0 }),
+                lease_secs,
+                ..v1::StatusResponse::default()
+            };
+            let check = workers(&status);
+            (check.state, check.detail)
+        };
+        let said = |state: &str, detail: &str| (state.to_owned(), detail.to_owned());
+        assert_eq!(at(100, 1000.0), said("ok", "2 connected"));
+        assert_eq!(
+            at(1020, 30.0),
+            said("ok", "1 connected; 1 not seen for 30 s")
+        );
+        assert_eq!(
+            at(1044, 0.0),
+            said("ok", "1 connected; 1 not seen for 45 s")
+        );
+        assert_eq!(
+            at(1046, 0.0),
+            said("warn", "none is connected; 2 not seen for 45 s")
+        );
     }
 }
