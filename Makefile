@@ -1,15 +1,16 @@
 # What the README names. Every target prints the commands that it runs; all of them work in plain sh.
 #
 #   make bake                       bake a generated demo capture, embedded: no service, no account, no GPU needed
-#   make bake CAPTURE=dir [OBJECT=collection/object] [PRESET=standard|paper] [OUT=dir] [ARGS="--size 128 ..."]
+#   make bake CAPTURE=dir [OBJECT=collection/object] [PRESET=auto|standard|paper] [OUT=dir] [ARGS="--size 128 ..."]
 #   make test                       everything: formats, lints, all tests; ends with "N passed, N failed"
 #   make lint                       formats and lints alone
 #   make setup                      libtorch into the per-user cache, linked as .libtorch
 #   make fuzz TARGET=name [SECS=60]  one parser under libFuzzer; needs cargo-fuzz, see tests/fuzz
+#   make ablation [CAPTURES="dir ..."] [ARGS="--seeds 1 --budget-secs 10"]  what each part of the recipe is worth
 #   make bench [BENCH=name] [ARGS="--views 20 --rounds 1"]   speed beside a peer, one case or all; see tests/bench
 
 .POSIX:
-.PHONY: bake test lint bench fuzz setup build
+.PHONY: bake test lint bench ablation fuzz setup build
 
 CARGO = cargo
 # One profile serves baking and testing: the numeric code is optimised in it, and nothing is compiled twice.
@@ -22,6 +23,7 @@ OUT =
 ARGS =
 BENCH =
 TARGET =
+CAPTURES =
 SECS = 60
 # The demo finishes within four minutes on two cores.
 DEMO_ARGS = --size 128 --budget-secs 90
@@ -54,6 +56,22 @@ test:
 lint: setup
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --workspace --all-targets --locked -- -D warnings
+
+# Without captures of one's own: matte, glossy, mirror-like, and one that breaks the rule that light stays still.
+ablation: build
+	@set -eu; bin=$(BIN); out=bake-out/ablation; captures='$(CAPTURES)'; \
+	if [ -z "$$captures" ]; then \
+		demo() { \
+			captures="$$captures $$out/captures/$$1"; \
+			if [ ! -e "$$out/captures/$$1/test.txt" ]; then \
+				rm -rf "$$out/captures/$$1"; mkdir -p "$$out/captures"; \
+				"$$bin/ign-worker" demo-capture "$$out/captures/$$1" --size 128 --views 64 $$2; \
+			fi; \
+		}; \
+		demo matte '--gloss 0'; demo glossy '--gloss 0.6 --seed 1'; \
+		demo mirror '--shape sphere --gloss 1 --seed 2'; demo turntable '--shape bowl --gloss 0.6 --seed 3 --turntable'; \
+	fi; \
+	"$$bin/ign-worker" experiment ablation $$captures --out "$$out" --size 96 $(ARGS)
 
 bench:
 	python3 tests/bench/run.py $(BENCH) $(ARGS)

@@ -25,8 +25,8 @@ const METHODS: [&str; 9] = [
 #[derive(Clone, Debug, clap::Args)]
 #[command(next_help_heading = "Recipe")]
 pub(crate) struct RecipeArgs {
-    /// What to train: `standard`, or `paper` for the published method
-    #[arg(long, value_parser = ["standard", "paper"], default_value = "standard")]
+    /// What to train: `auto` only what the scene needs, `standard` everything for a fixed time, `paper` the published method
+    #[arg(long, value_parser = ["auto", "standard", "paper"], default_value = "standard")]
     pub(crate) preset: String,
     /// Longer side of the rendered images, in pixels
     #[arg(long, value_name = "PX", default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=8192))]
@@ -44,6 +44,45 @@ pub(crate) struct RecipeArgs {
     /// Seed of everything random
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(crate) seed: u64,
+    #[command(flatten)]
+    pub(crate) limits: Limits,
+}
+
+/// What preset `auto` is held to; settings of the recipe by the same names.
+#[derive(Clone, Debug, Default, clap::Args)]
+#[command(next_help_heading = "Limits of preset auto")]
+pub(crate) struct Limits {
+    /// How much error may be left to save time
+    #[arg(long, value_parser = ["draft", "standard", "best"])]
+    pub(crate) quality: Option<String>,
+    /// Seconds that the whole bake may take
+    #[arg(long, value_name = "N")]
+    pub(crate) max_secs: Option<f64>,
+    /// Megabytes that a viewer has to load
+    #[arg(long, value_name = "MB")]
+    pub(crate) max_bundle_mb: Option<f64>,
+    /// Frames a second that rendering must reach on the machine that bakes
+    #[arg(long, value_name = "N")]
+    pub(crate) min_render_fps: Option<f64>,
+    /// PSNR on validation views, in dB, at which training may end
+    #[arg(long, value_name = "DB")]
+    pub(crate) target_psnr: Option<f64>,
+}
+
+impl Limits {
+    /// Those that are given, as settings.
+    fn settings(&self) -> impl Iterator<Item = (&'static str, String)> {
+        let number = |value: Option<f64>| value.map(|value| value.to_string());
+        [
+            ("quality", self.quality.clone()),
+            ("max_secs", number(self.max_secs)),
+            ("max_bundle_mb", number(self.max_bundle_mb)),
+            ("min_render_fps", number(self.min_render_fps)),
+            ("target_psnr", number(self.target_psnr)),
+        ]
+        .into_iter()
+        .filter_map(|(key, value)| Some((key, value?)))
+    }
 }
 
 /// The recipe on the wire.
@@ -83,6 +122,17 @@ impl RecipeArgs {
         if !self.methods.is_empty() {
             let methods = self.methods.join(",");
             recipe.settings.insert("methods".to_string(), methods);
+        }
+        for (key, value) in self.limits.settings() {
+            if self.preset != "auto" {
+                let flag = key.replace('_', "-");
+                return Err(
+                    Problem::usage(format!("--{flag} needs --preset auto")).hint(
+                        "the other presets have a fixed length and size; --budget-secs ends any",
+                    ),
+                );
+            }
+            recipe.settings.insert(key.to_string(), value);
         }
         for (key, value) in &self.set {
             match key.as_str() {
@@ -127,6 +177,7 @@ mod tests {
             set: set.iter().map(|text| key_value(text).unwrap()).collect(),
             budget_secs: Some(60),
             seed: 7,
+            limits: Limits::default(),
         }
     }
 
@@ -137,6 +188,19 @@ mod tests {
             recipe.unwrap().json().unwrap(),
             @r#"{"preset":"standard","size":128,"crop":"none","seed":7,"budget_secs":60,"proxy":"proxy/p.ply","settings":{"epochs":"3","lr":"1e-3","methods":"ibr,paper"}}"#
         );
+    }
+
+    #[test]
+    fn limits_are_settings_of_preset_auto() {
+        let mut args = args(&[]);
+        args.limits.quality = Some("draft".into());
+        args.limits.max_secs = Some(90.0);
+        let problem = args.recipe(None).unwrap_err();
+        assert!(problem.to_string().contains("--quality"), "{problem}");
+        args.preset = "auto".into();
+        let settings = args.recipe(None).unwrap().settings;
+        assert_eq!(settings["quality"], "draft");
+        assert_eq!(settings["max_secs"], "90");
     }
 
     #[test]

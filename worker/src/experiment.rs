@@ -23,9 +23,9 @@ pub(crate) struct Options {
     /// Folder for NAME.md, NAME.json, NAME.svg and the bakes; bakes that are there already are used again.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Bake the paper's recipe instead of preset standard.
-    #[arg(long)]
-    paper: bool,
+    /// What to train: auto, standard or paper.
+    #[arg(long, value_parser = preset, default_value = "standard")]
+    preset: Preset,
     /// Longer side of the rendered images, in pixels.
     #[arg(long, value_name = "PX", default_value_t = 128)]
     size: u32,
@@ -38,6 +38,12 @@ pub(crate) struct Options {
     /// Seed of everything random.
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
+    /// Seeds that `ablation` goes through, from --seed on.
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
+    seeds: u64,
+    /// Settings that `ablation` changes, `head,loss` say [default: all that differ between the presets].
+    #[arg(long, value_name = "KEYS", value_delimiter = ',')]
+    only: Vec<String>,
     /// A setting of the recipe; may be given again.
     #[arg(long, value_name = "KEY=VALUE", value_parser = key_value)]
     set: Vec<(String, String)>,
@@ -52,6 +58,11 @@ fn by_name() -> impl TypedValueParser<Value = Experiment> {
         let found = Experiment::ALL.into_iter().find(|e| e.name() == name);
         found.unwrap_or(Experiment::Methods)
     })
+}
+
+/// A preset by its name.
+fn preset(name: &str) -> Result<Preset, String> {
+    serde_json::from_value(name.into()).map_err(|_| "expected auto, standard or paper".to_owned())
 }
 
 fn key_value(text: &str) -> Result<(String, String), String> {
@@ -77,11 +88,7 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         experiment: options.experiment,
         captures: options.captures.clone(),
         recipe: Recipe {
-            preset: if options.paper {
-                Preset::Paper
-            } else {
-                Preset::Standard
-            },
+            preset: options.preset,
             size: options.size,
             crop: if options.window {
                 Crop::Object
@@ -93,6 +100,8 @@ pub(crate) fn run(options: &Options) -> Result<()> {
             proxy: None,
             settings: options.set.iter().cloned().collect(),
         },
+        seeds: options.seeds,
+        only: options.only.clone(),
         out: options.out.clone(),
         threads: threads.get(),
     };

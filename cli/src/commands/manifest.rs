@@ -148,10 +148,10 @@ fn row(
         .map_err(|error| faults.push(Problem::usage(error.to_string())))
         .ok();
     if let Some(preset) = cell("preset")
-        && !matches!(preset, "standard" | "paper")
+        && !matches!(preset, "auto" | "standard" | "paper")
     {
         faults.push(Problem::usage(format!(
-            "preset {preset:?} is neither standard nor paper"
+            "preset {preset:?} is none of auto, standard and paper"
         )));
     }
     let mut labels = BTreeMap::new();

@@ -20,13 +20,12 @@ use crate::BakeError;
 use crate::divergence::{Fallback, Watchdog};
 use crate::progress::Reporter;
 use crate::recipe::Recipe;
+use crate::schedule::{Course, Schedule};
 
-const SCHEMA: &str = "ign.checkpoint/1";
+const SCHEMA: &str = "ign.checkpoint/2";
 const META_KEY: &str = "ign";
 /// Checkpoint files kept in the work folder: an upload may still read the one before the newest.
 const KEPT_FILES: u64 = 3;
-/// Observations per stage: validation error, best weights, points of the speed-against-error curve.
-const OBSERVATIONS: u64 = 8;
 /// How often a stage may fall back to its last good state before it ends.
 const MAX_FALLBACKS: u32 = 4;
 /// Factor of the learning rate at every fallback.
@@ -45,6 +44,7 @@ struct Meta {
     current: Option<Current>,
     finished: Vec<String>,
     secs: BTreeMap<String, f64>,
+    steps: BTreeMap<String, u64>,
     measured: BTreeMap<String, f64>,
     curve: Vec<SpeedError>,
     fallbacks: Vec<Fallback>,
@@ -55,20 +55,11 @@ struct Current {
     stage: String,
     step: u64,
     elapsed_secs: f64,
-    observed: u64,
+    course: Course,
     rate_scale: f64,
     fallbacks: u32,
     watchdog: Watchdog,
     adam_steps: Vec<u64>,
-    /// Lowest observed error.
-    best_error: Option<f64>,
-}
-
-/// How long a stage trains.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Schedule {
-    pub(crate) steps: u64,
-    pub(crate) budget_secs: Option<f64>,
 }
 
 /// One network's training.
@@ -80,17 +71,22 @@ pub(crate) struct Stage<'a> {
     pub(crate) watch: Option<Watch<'a>>,
 }
 
-/// Views that are rendered now and then while a network trains.
+/// What is measured now and then while a network trains.
 pub(crate) struct Watch<'a> {
-    /// Row of metrics.json whose speed-against-error curve this is.
-    pub(crate) method: &'static str,
-    /// Training seconds spent before this stage on what the method needs.
-    pub(crate) secs_before: f64,
     /// Whether the weights of the lowest validation error are kept, not those of the end. The curve is the error of what
     /// would be kept if training ended there.
     pub(crate) keep_best: bool,
     /// Error on the validation views; `None` when there are none.
     pub(crate) validation: &'a dyn Fn(&Params) -> Option<f64>,
+    pub(crate) curve: Option<Curve<'a>>,
+}
+
+/// A speed-against-error curve.
+pub(crate) struct Curve<'a> {
+    /// Its row of metrics.json.
+    pub(crate) method: &'static str,
+    /// Training seconds spent before this stage on what the method needs.
+    pub(crate) secs_before: f64,
     /// Errors on the held-out views, full frame and object; they decide nothing.
     pub(crate) held_out: &'a dyn Fn(&Params) -> (f64, f64),
 }
@@ -163,6 +159,7 @@ impl<'a> Session<'a> {
                 current: None,
                 finished: Vec::new(),
                 secs: BTreeMap::new(),
+                steps: BTreeMap::new(),
                 measured: BTreeMap::new(),
                 curve: Vec::new(),
                 fallbacks: Vec::new(),
@@ -213,6 +210,11 @@ impl<'a> Session<'a> {
         self.meta.secs.get(stage).copied().unwrap_or(0.0)
     }
 
+    /// Training steps of a stage that has ended.
+    pub(crate) fn steps(&self, stage: &str) -> u64 {
+        self.meta.steps.get(stage).copied().unwrap_or(0)
+    }
+
     /// A figure that decided something; measured once, kept over a resume.
     pub(crate) fn measured(&mut self, name: &str, measure: impl FnOnce() -> f64) -> f64 {
         if let Some(value) = self.meta.measured.get(name) {
@@ -233,6 +235,11 @@ impl<'a> Session<'a> {
         self.meta.curve.push(point);
     }
 
+    /// Whether the curve of a method has begun.
+    pub(crate) fn has_curve(&self, method: &str) -> bool {
+        self.meta.curve.iter().any(|point| point.method == method)
+    }
+
     /// The speed-against-error curve so far.
     pub(crate) fn curve(&self) -> &[SpeedError] {
         &self.meta.curve
@@ -245,9 +252,8 @@ impl<'a> Session<'a> {
 
     /// Trains one stage to its end, from where a checkpoint left it, and keeps its first network's averaged weights.
     ///
-    /// `step` trains once and returns the loss; it gets the step's number, the fraction of the stage that is done and
-    /// a factor for its learning rate. The stage is watched about [`OBSERVATIONS`] times; time spent on that or on saving
-    /// does not count. A training that diverges goes back to the last observation with a lower rate, and after
+    /// `step` trains once and returns the loss; it gets the step's number and its learning rate as a share of the peak.
+    /// Time spent on watching or saving does not count. A training that diverges goes back to the last observation with a lower rate, and after
     /// [`MAX_FALLBACKS`] of these ends with its best weights.
     ///
     /// # Errors
@@ -256,9 +262,9 @@ impl<'a> Session<'a> {
         &mut self,
         stage: &Stage<'_>,
         mut trainees: Vec<Trainee>,
-        mut step: impl FnMut(&mut [Trainee], u64, f64, f64) -> f64,
+        mut step: impl FnMut(&mut [Trainee], u64, f64) -> f64,
     ) -> Result<(), BakeError> {
-        let name = stage.name;
+        let (name, schedule) = (stage.name, &stage.schedule);
         let mut best = None;
         let mut current = match self.meta.current.take() {
             Some(current) if current.stage == name => {
@@ -276,12 +282,11 @@ impl<'a> Session<'a> {
                 stage: name.into(),
                 step: 0,
                 elapsed_secs: 0.0,
-                observed: 0,
+                course: Course::default(),
                 rate_scale: 1.0,
                 fallbacks: 0,
                 watchdog: Watchdog::default(),
                 adam_steps: Vec::new(),
-                best_error: None,
             },
         };
         let mut good = (current.clone(), Snapshot::of(&trainees, best.as_ref()));
@@ -290,27 +295,26 @@ impl<'a> Session<'a> {
         let mut elapsed = before;
         let mut paused = 0.0;
         loop {
-            let by_steps = current.step as f64 / stage.schedule.steps.max(1) as f64;
-            let by_time = stage
-                .schedule
-                .budget_secs
-                .map_or(0.0, |budget| elapsed / budget.max(1e-3));
-            let fraction = by_steps.max(by_time).min(1.0);
-            if fraction * OBSERVATIONS as f64 >= current.observed as f64 {
+            let progress = schedule.progress(current.step, elapsed);
+            if schedule.is_due(&current.course, current.step, progress) {
                 let pause = Instant::now();
-                current.observed += 1;
-                if let Some(watch) = &stage.watch {
-                    let averaged = trainees[0].adam.averaged(&trainees[0].params);
-                    self.observe(watch, &averaged, &mut current, &mut best);
+                let averaged = trainees[0].adam.averaged(&trainees[0].params);
+                let watch = stage.watch.as_ref();
+                let error = watch.and_then(|watch| (watch.validation)(&averaged));
+                if let Some(watch) = watch {
+                    self.observe(watch, error, &averaged, &current, &mut best);
                 }
+                schedule.observed(&mut current.course, current.step, progress, error);
                 good = (current.clone(), Snapshot::of(&trainees, best.as_ref()));
                 paused += pause.elapsed().as_secs_f64();
             }
-            if fraction >= 1.0 {
+            let end = schedule.end(&current.course);
+            if progress >= end {
                 break;
             }
             let skipped = skipped_steps(&trainees);
-            let loss = step(&mut trainees, current.step, fraction, current.rate_scale);
+            let rate = schedule.rate(&current.course, current.step, progress) * current.rate_scale;
+            let loss = step(&mut trainees, current.step, rate);
             let applied = skipped_steps(&trainees) == skipped;
             current.step += 1;
             if let Some(reason) = current.watchdog.diverged(loss, applied) {
@@ -340,8 +344,10 @@ impl<'a> Session<'a> {
             }
             elapsed = before + clock.elapsed().as_secs_f64() - paused;
             current.elapsed_secs = elapsed;
-            self.reporter
-                .step(fraction, &format!("step {} loss {loss:.4}", current.step));
+            self.reporter.step(
+                progress / end,
+                &format!("step {} loss {loss:.4}", current.step),
+            );
             if self.last_saved.elapsed().as_secs_f64() >= self.interval_secs {
                 let pause = Instant::now();
                 self.save(Some((&current, &Snapshot::of(&trainees, best.as_ref()))))?;
@@ -349,6 +355,13 @@ impl<'a> Session<'a> {
             }
         }
         self.meta.secs.insert(name.into(), elapsed);
+        self.meta.steps.insert(name.into(), current.step);
+        if current.course.ended_early() {
+            self.reporter.info(format!(
+                "{name}: ended after {} steps: more did not pay",
+                current.step
+            ));
+        }
         let skipped = skipped_steps(&trainees);
         if skipped > 0 {
             self.reporter.warn(format!(
@@ -363,39 +376,41 @@ impl<'a> Session<'a> {
         self.finish(name, &averaged)
     }
 
-    /// Measures a network in training: keeps its weights where they are the best, adds a point to the curve.
+    /// Keeps the weights of a network in training where its validation error is the lowest, and adds a point to its curve.
     fn observe(
         &mut self,
         watch: &Watch<'_>,
+        error: Option<f64>,
         averaged: &Params,
-        current: &mut Current,
+        current: &Current,
         best: &mut Option<Vec<f32>>,
     ) {
-        let error = (watch.validation)(averaged);
-        if let Some(error) = error {
-            self.reporter.error(error);
-        }
-        let better = match (error, current.best_error) {
+        let better = match (error, current.course.lowest()) {
             (Some(error), Some(lowest)) => error <= lowest,
             _ => true,
         };
         if watch.keep_best && better {
-            current.best_error = error;
             *best = Some(flat_values(averaged.flat()));
+        }
+        let Some(curve) = &watch.curve else {
+            return;
+        };
+        if let Some(error) = error {
+            self.reporter.error(error);
         }
         let before = self
             .meta
             .curve
             .iter()
-            .rfind(|point| point.method == watch.method)
+            .rfind(|point| point.method == curve.method)
             .map(|point| (point.mse, point.mse_object));
         let (mse, mse_object) = match before {
             Some(errors) if watch.keep_best && !better => errors,
-            _ => (watch.held_out)(averaged),
+            _ => (curve.held_out)(averaged),
         };
         self.curve_point(SpeedError {
-            method: watch.method.into(),
-            secs: watch.secs_before + current.elapsed_secs,
+            method: curve.method.into(),
+            secs: curve.secs_before + current.elapsed_secs,
             mse,
             mse_object,
         });
@@ -583,7 +598,7 @@ pub(crate) fn parse(data: &[u8]) -> Result<Stored, String> {
 impl Current {
     /// Whether training can go on from these figures.
     fn holds(&self) -> bool {
-        let counts = [self.step, self.observed, self.fallbacks.into()];
+        let counts = [self.step, self.fallbacks.into()];
         counts
             .iter()
             .chain(&self.adam_steps)
@@ -592,6 +607,7 @@ impl Current {
             && self.elapsed_secs >= 0.0
             && self.rate_scale > 0.0
             && self.rate_scale <= 1.0
+            && self.course.holds()
     }
 }
 
@@ -623,6 +639,7 @@ fn floats(data: &[u8]) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::schedule::Rate;
     use ign_nets::params::Init;
     use tch::{Tensor, no_grad};
 
@@ -650,18 +667,20 @@ mod tests {
     /// Errors are the number's square.
     fn watch() -> Watch<'static> {
         Watch {
-            method: "ours",
-            secs_before: 3.0,
             keep_best: true,
             validation: &|params| Some(value(params).powi(2)),
-            held_out: &|params| (value(params).powi(2), 0.0),
+            curve: Some(Curve {
+                method: "ours",
+                secs_before: 3.0,
+                held_out: &|params| (value(params).powi(2), 0.0),
+            }),
         }
     }
 
     /// Trains with `step`; returns the outcome, the weight that is kept and the fallbacks.
     fn trained(
         watched: bool,
-        step: impl FnMut(&mut [Trainee], u64, f64, f64) -> f64,
+        step: impl FnMut(&mut [Trainee], u64, f64) -> f64,
     ) -> (Result<(), BakeError>, f64, Vec<Fallback>, Vec<String>) {
         let dir = tempfile::tempdir().expect("a folder");
         let said = std::cell::RefCell::new(Vec::new());
@@ -689,6 +708,7 @@ mod tests {
             schedule: Schedule {
                 steps: 64,
                 budget_secs: None,
+                rate: Rate::Constant,
             },
             watch: watched.then_some(watch),
         };
@@ -711,7 +731,7 @@ mod tests {
     #[test]
     fn a_rate_that_diverges_is_noticed_within_a_few_steps_and_lowered() {
         let (outcome, kept, fallbacks, said) =
-            trained(true, |trainees, _, _, scale| step(trainees, 2.0 * scale));
+            trained(true, |trainees, _, scale| step(trainees, 2.0 * scale));
         outcome.expect("it ends");
         assert_eq!(fallbacks.len(), 1, "{fallbacks:?}");
         let fallback = &fallbacks[0];
@@ -724,7 +744,7 @@ mod tests {
     #[test]
     fn a_poisoned_batch_costs_the_steps_since_the_last_observation() {
         let mut poisoned = false;
-        let (outcome, kept, fallbacks, _) = trained(true, |trainees, at, _, scale| {
+        let (outcome, kept, fallbacks, _) = trained(true, |trainees, at, scale| {
             if at == 20 && !poisoned {
                 poisoned = true;
                 drop(no_grad(|| {
@@ -749,7 +769,7 @@ mod tests {
             if at < 20 { loss } else { f64::INFINITY }
         };
         let (outcome, kept, fallbacks, _) =
-            trained(true, |trainees, at, _, scale| poison(trainees, at, scale));
+            trained(true, |trainees, at, scale| poison(trainees, at, scale));
         outcome.expect("it ends");
         assert_eq!(fallbacks.len(), MAX_FALLBACKS as usize + 1);
         assert!(
@@ -758,7 +778,7 @@ mod tests {
                 .is_some_and(|last| last.words().contains("for good"))
         );
         assert!(kept > 0.0 && kept < 0.1, "{kept}");
-        let (outcome, ..) = trained(false, |trainees, at, _, scale| poison(trainees, at, scale));
+        let (outcome, ..) = trained(false, |trainees, at, scale| poison(trainees, at, scale));
         assert!(matches!(
             outcome,
             Err(BakeError::Diverged {
@@ -784,18 +804,19 @@ mod tests {
             schedule: Schedule {
                 steps: 64,
                 budget_secs: None,
+                rate: Rate::Constant,
             },
             watch: Some(watch()),
         };
         // Down for half of the time, then slowly up again.
-        let train = |trainees: &mut [Trainee], at: u64, _, _| {
+        let train = |trainees: &mut [Trainee], at: u64, _| {
             step(trainees, if at < 32 { 0.05 } else { -0.02 })
         };
         session
             .train(&stage, vec![trainee], train)
             .expect("it ends");
         let curve: Vec<f64> = session.curve().iter().map(|point| point.mse).collect();
-        assert_eq!(curve.len(), OBSERVATIONS as usize + 1);
+        assert_eq!(curve.len(), 9);
         assert!(curve.windows(2).all(|pair| pair[1] <= pair[0]), "{curve:?}");
         assert!(session.curve().iter().all(|point| point.secs >= 3.0));
         let (_, kept) = session

@@ -4,17 +4,18 @@
 
 use ign_nets::composition::PaperComposition;
 use ign_render::{
-    ColorGrid, Model, Recipe, RenderSettings, SurfaceColors, Target, Translation, TranslationInput,
+    ColorGrid, Model, RenderSettings, SurfaceColors, Target, Translation, TranslationInput,
     debevec_ibr, naive_ibr,
 };
 use tch::Tensor;
 
 use crate::BakeError;
-use crate::checkpoint::{Schedule, Session};
+use crate::checkpoint::Session;
 use crate::composition::{self, GeneratorInput, Plan};
 use crate::evaluate::{Row, score};
-use crate::recipe::{Method, Preset};
-use crate::training::{Drawn, Trained, Trainer};
+use crate::recipe::{EffectsChoice, Method, Preset, Recipe};
+use crate::schedule::{Rate, Schedule};
+use crate::training::{Drawn, OURS_NO_EFFECTS, PAPER, Trained, Trainer};
 
 /// A method that trained, ready to be scored.
 enum Rival {
@@ -65,25 +66,33 @@ fn rival(
     chosen: &[usize],
     method: Method,
 ) -> Result<Rival, BakeError> {
-    let paper_preset = trainer.settings.preset == Preset::Paper;
+    let paper = Recipe {
+        preset: Preset::Paper,
+        ..Recipe::default()
+    }
+    .resolve(trainer.data.train.len())?;
+    let beside_paper = trainer.settings.preset == Preset::Paper;
     // The paper's networks have the paper's schedule, unless ours took less.
-    let schedule = if paper_preset {
-        Schedule {
-            steps: trainer.settings.composition_steps,
-            budget_secs: trainer.recipe.budget_secs,
-        }
+    let budget_secs = if beside_paper {
+        trainer.budget_secs
     } else {
-        Schedule {
-            steps: trainer.epochs(),
-            budget_secs: Some(ours.secs),
-        }
+        Some(ours.secs)
     };
     let translation = |session: &mut Session<'_>, stage: &'static str, input| {
+        let steps = if beside_paper {
+            trainer.settings.composition_steps
+        } else {
+            paper.composition_steps
+        };
         let plan = Plan {
             stage,
             method: method.name(),
-            schedule,
-            seed: trainer.recipe.seed,
+            schedule: Schedule {
+                steps,
+                budget_secs,
+                rate: Rate::Constant,
+            },
+            seed: trainer.seed,
             secs_before: 0.0,
         };
         translation(trainer, session, &plan, input)
@@ -91,19 +100,34 @@ fn rival(
     Ok(match method {
         Method::OursNoEffects if ours.model.effects().is_none() => Rival::Ours,
         Method::OursNoEffects => {
-            let budget = trainer.recipe.budget_secs.map(|_| ours.secs);
-            Rival::Model(Box::new(trainer.without_effects(session, budget)?), None)
+            let mut settings = trainer.settings.clone();
+            settings.effects = EffectsChoice::Off;
+            let by_the_clock = trainer.budget_secs.is_some() || settings.preset == Preset::Auto;
+            if settings.preset == Preset::Auto {
+                // As long as ours, whether that pays without effects or not.
+                settings.preset = Preset::Standard;
+            }
+            let without = Trainer {
+                settings: &settings,
+                budget_secs: by_the_clock.then_some(ours.secs),
+                ..*trainer
+            };
+            Rival::Model(Box::new(without.train(session, OURS_NO_EFFECTS)?), None)
         }
         Method::Paper => {
             let settings = RenderSettings {
-                supersample: 1,
-                recipe: Recipe::Paper,
+                supersample: paper.supersample,
+                recipe: paper.drawing,
                 ..trainer.drawn.settings.clone()
             };
             let drawn = Drawn::new(trainer.data, chosen, settings, 1)?;
-            let steps = (schedule.steps, schedule.steps);
-            let budget = schedule.budget_secs;
-            let trained = trainer.paper(session, &drawn, steps, budget, method.name())?;
+            let published = Trainer {
+                settings: &paper,
+                drawn: &drawn,
+                budget_secs,
+                ..*trainer
+            };
+            let trained = published.train(session, PAPER)?;
             Rival::Model(Box::new(trained), Some(drawn))
         }
         Method::Pix2pixPosition => {
@@ -129,6 +153,7 @@ fn translation(
             channels,
             of: &|target| input.of(target),
             settings: &trainer.drawn.settings,
+            adversarial: true,
         };
         composition::train_generator(data, session, &seen, plan, trainer.drawn.views())?;
     }

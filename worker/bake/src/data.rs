@@ -14,6 +14,7 @@
 
 use ign_capture::{Background, Frame, Gains, ImportError, Scene, ViewImage};
 use ign_geometry::select::Candidates;
+use ign_geometry::silhouette::{self, Outline};
 use ign_geometry::simplify::simplify;
 use ign_geometry::{Camera, Drawable, Mesh, Similarity};
 use ign_nets::color;
@@ -22,7 +23,7 @@ use rayon::prelude::*;
 use tch::{Device, Kind, Tensor};
 
 use crate::BakeError;
-use crate::recipe::{Crop, Preset, Recipe, Settings};
+use crate::recipe::{Crop, Recipe, Settings};
 
 /// Of the training views, one in so many validates: it is neither trained on nor a reference.
 const VALIDATION_EVERY: usize = 10;
@@ -30,6 +31,8 @@ const VALIDATION_EVERY: usize = 10;
 const VALIDATION_MOST: usize = 8;
 /// Coverage below which a colour cannot be divided out of its background.
 const LEAST_COVERAGE: f32 = 0.1;
+/// Training views whose masks the proxy is fitted to, at most.
+const FIT_VIEWS: usize = 48;
 /// Long side of the G-buffers on which references are chosen.
 const SELECTION_PX: u32 = 64;
 
@@ -154,10 +157,7 @@ impl<'a> Dataset<'a> {
             k: settings.k,
             supersample,
             coverage,
-            recipe: match settings.preset {
-                Preset::Paper => ign_render::Recipe::Paper,
-                Preset::Standard => ign_render::Recipe::Standard,
-            },
+            recipe: settings.drawing,
         };
         let mesh = scene.mesh.transformed(&normalisation);
         Ok(Self {
@@ -179,6 +179,40 @@ impl<'a> Dataset<'a> {
                 .collect(),
             device,
         })
+    }
+
+    /// Brings the proxy's outline to the masks of the training views where that helps views that had no part in it, if
+    /// `wanted`; what was done, in words.
+    pub(crate) fn fit_proxy(&mut self, wanted: bool) -> Result<Option<String>, BakeError> {
+        let masked = |view: &&usize| self.scene.views[**view].mask.is_some();
+        let views: Vec<usize> = self.train.iter().filter(masked).copied().collect();
+        if !wanted || views.is_empty() {
+            return Ok(None);
+        }
+        let outlines = spread(&views, FIT_VIEWS)
+            .into_par_iter()
+            .map(|view| {
+                let (camera, world) = self.cameras(view, self.reference_scale);
+                let image = self.scene.load_view(view, &world)?;
+                let known = image.mask.unwrap_or_default().into_iter().zip(image.inside);
+                let coverage = known
+                    .map(|(covered, inside)| if inside < 0.5 { f32::NAN } else { covered })
+                    .collect();
+                Ok(Outline { camera, coverage })
+            })
+            .collect::<Result<Vec<Outline>, BakeError>>()?;
+        let Some(fitted) = silhouette::fit(&self.mesh, &outlines) else {
+            return Ok(None);
+        };
+        self.mesh = fitted.mesh;
+        self.proxy = Drawable::new(&self.mesh);
+        let scale = f64::from(self.reference_scale);
+        Ok(Some(format!(
+            "The proxy's outline was off the masks by {:.2} px; fitted to them it is off by {:.2} px, in views that had no \
+             part in that.",
+            fitted.before_px / scale,
+            fitted.after_px / scale
+        )))
     }
 
     /// Simplifies the proxy as far as the training views allow at the references' resolution, if `wanted`, and says so.

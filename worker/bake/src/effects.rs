@@ -7,32 +7,51 @@
 
 use ign_nets::effects::{PaperEffects, PointEffects};
 use ign_nets::losses::{self, Pair};
-use ign_nets::optim::{Trainee, cosine_rate};
+use ign_nets::optim::Trainee;
 use ign_nets::steps::{self, SPARSITY, SiamesePair};
 use ign_nets::warp::{Sources, directions};
 use ign_nets::{Builder, Params};
 use ign_render::{RenderSettings, Target};
 use rand::RngExt;
 use rayon::prelude::*;
-use tch::{Device, Kind, Tensor};
+use tch::{Device, Kind, Tensor, no_grad};
 
 use crate::BakeError;
-use crate::checkpoint::{Schedule, Session, Stage};
+use crate::checkpoint::{Session, Stage, Watch};
 use crate::data::Dataset;
 use crate::sampler::{indices, step_rng};
+use crate::schedule::Schedule;
 
-/// Weights average over about so many steps' worth: 1 / (1 - decay).
-const AVERAGE_DECAY: f64 = 0.995;
 /// Peak learning rate of the point effects (paper: 1e-3 constant for its U-Net).
 const POINT_RATE: f64 = 2e-3;
 /// Surface observations kept at most; more views thin them out evenly.
 const MOST_OBSERVATIONS: usize = 4_000_000;
 
-/// Name of the stage in checkpoints.
-pub(crate) const STAGE: &str = "effects";
+/// Pairs with a validation view, which say how well effects predict what was not trained on.
+const UNSEEN_BATCHES: usize = 4;
+const UNSEEN_BATCH: i64 = 8192;
+const UNSEEN: &str = "effects_unseen";
 
-/// Every surface point that a training view sees, with its colour.
+/// Name and length of one training.
+pub(crate) struct Plan {
+    /// Stage in checkpoints.
+    pub(crate) stage: &'static str,
+    pub(crate) schedule: Schedule,
+    pub(crate) seed: u64,
+    /// Observations per step of the point effects.
+    pub(crate) batch: i64,
+    /// Decay of the average of weights that is kept.
+    pub(crate) average_decay: f64,
+    /// What layers of the point effects compute in.
+    pub(crate) kind: Kind,
+}
+
+/// Every surface point that a training or validation view sees, with its colour; the training views come first.
 struct Observations {
+    /// Number of points that training views see.
+    trained_points: i64,
+    /// Number of training views.
+    trained_views: i64,
     /// [N, 3].
     points: Tensor,
     /// [N, 3].
@@ -58,8 +77,8 @@ fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
         alpha: Vec<u8>,
     }
     let per_view = MOST_OBSERVATIONS / data.train.len().max(1);
-    let views: Vec<One> = data
-        .train
+    let all: Vec<usize> = data.train.iter().chain(&data.validation).copied().collect();
+    let views: Vec<One> = all
         .par_iter()
         .map(|&view| {
             let straight = data.straight(view, data.reference_scale)?;
@@ -162,7 +181,10 @@ fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
             ))
         })
         .collect();
+    let trained = &views[..data.train.len()];
     Ok(Observations {
+        trained_points: trained.iter().map(|v| v.points.len() as i64 / 3).sum(),
+        trained_views: data.train.len() as i64,
         points: stack(|v| &v.points),
         normals: stack(|v| &v.normals),
         colors: stack(|v| &v.colors),
@@ -186,109 +208,148 @@ fn padded<T: Copy + Default>(from: &[T], width: u32, channels: usize, to: (u32, 
     out
 }
 
-/// Trains the point effects of preset `standard`.
+/// Trains the effects per surface point.
 pub(crate) fn train_points(
     data: &Dataset<'_>,
     session: &mut Session<'_>,
-    schedule: Schedule,
-    (seed, batch): (u64, i64),
+    plan: &Plan,
 ) -> Result<(), BakeError> {
+    let (seed, batch) = (plan.seed, plan.batch);
     let observations = observe_all(data)?;
     let mut builder = Builder::new();
     let net = PointEffects::new(&mut builder);
-    let trainee = Trainee::new(builder.build(data.device, seed), AVERAGE_DECAY);
-    let count = observations.points.size()[0];
-    let views = observations.sources.len() as i64;
+    let trainee = Trainee::new(builder.build(data.device, seed), plan.average_decay);
+    let unseen = unseen_pairs(&observations, seed);
     let stage = Stage {
-        name: STAGE,
-        schedule,
-        watch: None,
+        name: plan.stage,
+        schedule: plan.schedule,
+        watch: Some(Watch {
+            keep_best: false,
+            validation: &|params| unseen_error(&unseen, &net, params),
+            curve: None,
+        }),
     };
-    session.train(&stage, vec![trainee], |trainees, step, fraction, scale| {
+    session.train(&stage, vec![trainee], |trainees, step, rate| {
         let trainee = &mut trainees[0];
-        let mut rng = step_rng(seed, STAGE, step);
-        let pick = indices(&mut rng, batch, count, data.device);
-        let other = indices(&mut rng, batch, views, data.device);
-        let Some(loss) = point_loss(&observations, &net, &trainee.params, &pick, &other) else {
+        let mut rng = step_rng(seed, plan.stage, step);
+        let device = data.device;
+        let pick = indices(&mut rng, batch, observations.trained_points, device);
+        let other = indices(&mut rng, batch, observations.trained_views, device);
+        let Some(pairs) = Pairs::new(&observations, &pick, &other) else {
             return 0.0;
         };
+        let (here, there) = pairs.effects(&net, &trainee.params.in_kind(plan.kind));
+        let size = losses::sparsity(&here) + losses::sparsity(&there);
+        let loss = losses::pair(&pairs.with(&here, &there)) + size * (0.5 * SPARSITY);
         let value = loss.double_value(&[]);
         loss.backward();
-        trainee.step(cosine_rate(POINT_RATE, fraction) * scale, 1.0);
+        trainee.step(POINT_RATE * rate, 1.0);
         value
     })
 }
 
-/// Mean prediction error over the pairs that see each other, plus the sparsity term; `None` when no pair does.
-fn point_loss(
-    all: &Observations,
-    net: &PointEffects,
-    params: &Params,
-    pick: &Tensor,
-    other: &Tensor,
-) -> Option<Tensor> {
-    let points = all.points.index_select(0, pick);
-    let normals = all.normals.index_select(0, pick);
-    let taps = all.sources.taps(&points, &normals, other);
-    let same = all.views.index_select(0, pick).eq_tensor(other);
-    let valid = taps
-        .visibility
-        .gt(0.9)
-        .logical_and(&taps.facing.gt(0.3))
-        .logical_and(&same.logical_not());
-    let rows = valid.nonzero().view([-1]);
-    if rows.size()[0] == 0 {
-        return None;
+/// Observations of validation views beside those of training views at the same points.
+fn unseen_pairs(all: &Observations, seed: u64) -> Vec<Pairs> {
+    let unseen = all.points.size()[0] - all.trained_points;
+    if unseen == 0 {
+        return Vec::new();
     }
-    let cut = |t: &Tensor| t.index_select(0, &rows);
-    let (points, normals) = (cut(&points), cut(&normals));
-    let here_view = all.views.index_select(0, &pick.index_select(0, &rows));
-    let there_view = cut(other);
-    let color_here = all.colors.index_select(0, &pick.index_select(0, &rows));
-    let (index, weight) = (cut(&taps.index), cut(&taps.weight));
-    let n = rows.size()[0];
-    let flat = index.view([-1]);
-    let weight = weight
-        * all
-            .source_alpha
-            .index_select(0, &flat)
-            .view([n, 4])
-            .to_kind(Kind::Float)
-        / 255.0;
-    let total = weight.sum_dim_intlist([1i64].as_slice(), true, Kind::Float);
-    let picked = all
-        .source_colors
-        .index_select(0, &flat)
-        .view([n, 4, 3])
-        .to_kind(Kind::Float)
-        / 255.0;
-    let color_there =
-        (picked * weight.unsqueeze(2)).sum_dim_intlist([1i64].as_slice(), false, Kind::Float)
-            / total.clamp_min(1e-3);
-    let sound = total.gt(0.9).to_kind(Kind::Float);
+    let mut rng = step_rng(seed, UNSEEN, 0);
+    (0..UNSEEN_BATCHES)
+        .filter_map(|_| {
+            let device = all.points.device();
+            let pick = indices(&mut rng, UNSEEN_BATCH, unseen, device) + all.trained_points;
+            let other = indices(&mut rng, UNSEEN_BATCH, all.trained_views, device);
+            Pairs::new(all, &pick, &other)
+        })
+        .collect()
+}
 
-    let centers = all.sources.centers();
-    let here = net.forward(
-        params,
-        &points,
-        &normals,
-        &directions(&centers.index_select(0, &here_view), &points),
-    );
-    let there = net.forward(
-        params,
-        &points,
-        &normals,
-        &directions(&centers.index_select(0, &there_view), &points),
-    );
-    let data_term = losses::pair(&Pair {
-        color_here: &color_here,
-        color_there: &color_there,
-        effects_here: &here,
-        effects_there: &there,
-        sound: &sound,
+/// Mean squared error, on [0, 255], of predicting validation views from training views and effects.
+fn unseen_error(unseen: &[Pairs], net: &PointEffects, params: &Params) -> Option<f64> {
+    let errors = unseen.iter().map(|pairs| {
+        no_grad(|| {
+            let (here, there) = pairs.effects(net, params);
+            losses::pair_error(&pairs.with(&here, &there)).double_value(&[])
+        })
     });
-    let size = losses::sparsity(&here) + losses::sparsity(&there);
-    Some(data_term + size * (0.5 * SPARSITY))
+    let sum: f64 = errors.sum();
+    (!unseen.is_empty()).then(|| sum / unseen.len() as f64 * 255.0 * 255.0)
+}
+
+/// Surface points that two views each see, with what they saw.
+struct Pairs {
+    /// [P, 3] each.
+    points: Tensor,
+    normals: Tensor,
+    to_here: Tensor,
+    to_there: Tensor,
+    color_here: Tensor,
+    color_there: Tensor,
+    /// [P, 1].
+    sound: Tensor,
+}
+
+impl Pairs {
+    /// What `other` ([N], views) sees at the points of observations `pick` ([N]); `None` when it sees none.
+    fn new(all: &Observations, pick: &Tensor, other: &Tensor) -> Option<Self> {
+        let points = all.points.index_select(0, pick);
+        let normals = all.normals.index_select(0, pick);
+        let taps = all.sources.taps(&points, &normals, other);
+        let same = all.views.index_select(0, pick).eq_tensor(other);
+        let valid = taps
+            .visibility
+            .gt(0.9)
+            .logical_and(&taps.facing.gt(0.3))
+            .logical_and(&same.logical_not());
+        let rows = valid.nonzero().view([-1]);
+        let n = rows.size()[0];
+        if n == 0 {
+            return None;
+        }
+        let cut = |t: &Tensor| t.index_select(0, &rows);
+        let (points, normals, pick) = (cut(&points), cut(&normals), cut(pick));
+        let flat = cut(&taps.index).view([-1]);
+        let alpha = all.source_alpha.index_select(0, &flat).view([n, 4]);
+        let weight = cut(&taps.weight) * alpha.to_kind(Kind::Float) / 255.0;
+        let total = weight.sum_dim_intlist([1i64].as_slice(), true, Kind::Float);
+        let picked = all
+            .source_colors
+            .index_select(0, &flat)
+            .view([n, 4, 3])
+            .to_kind(Kind::Float)
+            / 255.0;
+        let color_there =
+            (picked * weight.unsqueeze(2)).sum_dim_intlist([1i64].as_slice(), false, Kind::Float)
+                / total.clamp_min(1e-3);
+        let centers = all.sources.centers();
+        let towards = |views: &Tensor| directions(&centers.index_select(0, views), &points);
+        Some(Self {
+            to_here: towards(&all.views.index_select(0, &pick)),
+            to_there: towards(&cut(other)),
+            color_here: all.colors.index_select(0, &pick),
+            color_there,
+            sound: total.gt(0.9).to_kind(Kind::Float),
+            points,
+            normals,
+        })
+    }
+
+    /// Effects as seen from here and from there: [P, 3] each, linear light.
+    fn effects(&self, net: &PointEffects, params: &Params) -> (Tensor, Tensor) {
+        let seen_from = |to_viewer| net.forward(params, &self.points, &self.normals, to_viewer);
+        (seen_from(&self.to_here), seen_from(&self.to_there))
+    }
+
+    fn with<'a>(&'a self, here: &'a Tensor, there: &'a Tensor) -> Pair<'a> {
+        Pair {
+            color_here: &self.color_here,
+            color_there: &self.color_there,
+            effects_here: here,
+            effects_there: there,
+            sound: &self.sound,
+        }
+    }
 }
 
 /// Everything the paper's `EffectsNet` needs of one training view.
@@ -309,10 +370,8 @@ struct PaperView {
 pub(crate) fn train_paper(
     data: &Dataset<'_>,
     session: &mut Session<'_>,
-    name: &'static str,
+    plan: &Plan,
     settings: &RenderSettings,
-    schedule: Schedule,
-    seed: u64,
 ) -> Result<(), BakeError> {
     let views: Vec<PaperView> = data
         .train
@@ -346,14 +405,15 @@ pub(crate) fn train_paper(
         .collect::<Result<_, BakeError>>()?;
     let mut builder = Builder::new();
     let net = PaperEffects::new(&mut builder);
-    let trainee = Trainee::new(builder.build(data.device, seed), 0.0);
+    let params = builder.build(data.device, plan.seed);
+    let trainee = Trainee::new(params, plan.average_decay);
     let stage = Stage {
-        name,
-        schedule,
+        name: plan.stage,
+        schedule: plan.schedule,
         watch: None,
     };
-    session.train(&stage, vec![trainee], |trainees, step, _, scale| {
-        let mut rng = step_rng(seed, name, step);
+    session.train(&stage, vec![trainee], |trainees, step, rate| {
+        let mut rng = step_rng(plan.seed, plan.stage, step);
         let p = &views[rng.random_range(0..views.len())];
         let q = &views[rng.random_range(0..views.len())];
         let map = p.geometry.view([9, -1]).tr().index_select(0, &p.pixels);
@@ -368,6 +428,6 @@ pub(crate) fn train_paper(
             surface: &p.pixels,
             taps: &sources.taps(&points, &normals, &zeros).weighted(&q.mask),
         };
-        steps::effects_step(&net, &mut trainees[0], &pair, steps::RATE * scale)
+        steps::effects_step(&net, &mut trainees[0], &pair, steps::RATE * rate)
     })
 }

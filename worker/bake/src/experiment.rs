@@ -3,6 +3,7 @@
 //! Bakes stay in `bakes/` below the output folder. One that is there already, of the same capture and recipe, is not made
 //! again: an experiment of hours goes on where it was interrupted.
 
+mod ablation;
 mod diffuse;
 mod table;
 mod temporal;
@@ -41,18 +42,21 @@ pub enum Experiment {
     Corpus,
     /// The number of references, and of nearest views K.
     References,
+    /// What each departure from the paper's recipe is worth, over captures and seeds.
+    Ablation,
     /// Coherence along the path of the held-out views: how much a frame differs from the one before, warped.
     Temporal,
 }
 
 impl Experiment {
     /// All experiments.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::Methods,
         Self::Effects,
         Self::Diffuse,
         Self::Corpus,
         Self::References,
+        Self::Ablation,
         Self::Temporal,
     ];
 
@@ -64,6 +68,7 @@ impl Experiment {
             Self::Diffuse => "diffuse",
             Self::Corpus => "corpus",
             Self::References => "references",
+            Self::Ablation => "ablation",
             Self::Temporal => "temporal",
         }
     }
@@ -78,6 +83,10 @@ pub struct ExperimentJob {
     pub captures: Vec<PathBuf>,
     /// What all bakes have in common.
     pub recipe: Recipe,
+    /// Seeds that `ablation` goes through, from the recipe's on.
+    pub seeds: u64,
+    /// Settings that `ablation` changes; none: all that it knows.
+    pub only: Vec<String>,
     /// Tables, plot and bakes go here.
     pub out: PathBuf,
     /// Cores to use.
@@ -102,6 +111,7 @@ pub fn run(job: &ExperimentJob, events: &dyn Fn(Event)) -> Result<Vec<PathBuf>, 
         Experiment::Diffuse => lab.diffuse()?,
         Experiment::Corpus => lab.corpus()?,
         Experiment::References => lab.references()?,
+        Experiment::Ablation => lab.ablation()?,
         Experiment::Temporal => lab.temporal()?,
     };
     table.write(&job.out, job.experiment.name())
@@ -157,7 +167,16 @@ impl Lab<'_> {
         variant: &str,
         settings: &[(&str, String)],
     ) -> Result<Baked, BakeError> {
-        let mut recipe = self.job.recipe.clone();
+        self.baked_as(self.job.recipe.clone(), subject, variant, settings)
+    }
+
+    fn baked_as(
+        &self,
+        mut recipe: Recipe,
+        subject: &Subject<'_>,
+        variant: &str,
+        settings: &[(&str, String)],
+    ) -> Result<Baked, BakeError> {
         for (key, value) in settings {
             recipe.settings.insert((*key).to_owned(), value.clone());
         }

@@ -17,10 +17,12 @@ pub mod experiment;
 #[doc(hidden)]
 pub mod fuzz;
 mod pack;
+mod plan;
 mod progress;
 mod recipe;
 mod run;
 mod sampler;
+mod schedule;
 mod training;
 
 pub use error::BakeError;

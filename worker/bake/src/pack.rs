@@ -31,7 +31,7 @@ const PREVIEW_FRAME_MS: i32 = 90;
 /// WebP's quality, 0 to 100.
 const PREVIEW_QUALITY: f32 = 85.0;
 /// Pixels of a preview frame's sides.
-const PREVIEW_PX: u32 = 192;
+pub(crate) const PREVIEW_PX: u32 = 192;
 /// Held-out views that the report shows.
 const REPORT_VIEWS: usize = 4;
 

@@ -2,17 +2,29 @@
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use tch::Kind;
 
 use crate::BakeError;
+use crate::schedule::{Rate, Worth};
 
 /// Of a capture.
 const MOST_VIEWS: usize = 1_000_000;
+/// Settings that say what preset `auto` is to decide.
+const AUTO_ONLY: [&str; 5] = [
+    "quality",
+    "target_psnr",
+    "max_secs",
+    "max_bundle_mb",
+    "min_render_fps",
+];
 
 /// Named starting points of a recipe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Preset {
-    /// What measured best; the default.
+    /// What the scene needs: each part only if it pays, and only for as long as it does.
+    Auto,
+    /// Everything that measured best, with a fixed length; the default.
     #[default]
     Standard,
     /// The paper's networks, losses and schedule.
@@ -116,6 +128,34 @@ impl Method {
     }
 }
 
+/// How much error preset `auto` leaves to save time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Quality {
+    Draft,
+    Standard,
+    Best,
+}
+
+impl Quality {
+    /// Share by which a doubling of a training must lower the error.
+    fn least_gain(self) -> f64 {
+        match self {
+            Self::Draft => 0.15,
+            Self::Standard => 0.05,
+            Self::Best => 0.015,
+        }
+    }
+
+    /// The longest training, as a multiple of preset `standard`'s.
+    fn most(self) -> f64 {
+        match self {
+            Self::Draft => 0.5,
+            Self::Standard => 2.0,
+            Self::Best => 8.0,
+        }
+    }
+}
+
 /// When `EffectsNet` is trained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum EffectsChoice {
@@ -123,6 +163,33 @@ pub(crate) enum EffectsChoice {
     Auto,
     On,
     Off,
+}
+
+/// Which form of `EffectsNet`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum EffectsNet {
+    /// A perceptron per surface point.
+    Points,
+    /// The paper's.
+    UNet,
+}
+
+/// Which form of `CompositionNet`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Head {
+    /// Weights for the warped views and one generated layer.
+    Blend,
+    /// The paper's: paints colours.
+    Paint,
+}
+
+/// What the blending head minimises.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Loss {
+    /// Absolute differences.
+    L1,
+    /// Absolute plus squared differences.
+    Mixed,
 }
 
 /// Whether photographs are brought to one exposure.
@@ -137,12 +204,40 @@ pub(crate) enum GainsChoice {
 #[derive(Clone, Debug)]
 pub(crate) struct Settings {
     pub(crate) preset: Preset,
+    pub(crate) quality: Quality,
+    /// Validation PSNR, in dB, at which training ends.
+    pub(crate) target_psnr: Option<f64>,
+    /// Seconds that the whole bake may take.
+    pub(crate) max_secs: Option<f64>,
+    /// Megabytes (10^6) of what a viewer needs of the bundle.
+    pub(crate) max_bundle_mb: Option<f64>,
+    /// Frames a second that rendering must reach on the machine that bakes.
+    pub(crate) min_render_fps: Option<f64>,
+    /// Whether there is a `CompositionNet`.
+    pub(crate) compose: bool,
     pub(crate) k: usize,
     /// Training views that are used at most, evenly spread; the others are left out.
     pub(crate) train_views: usize,
     pub(crate) references: usize,
     pub(crate) supersample: u32,
+    /// Which normals networks see, and how the views of a pixel are chosen.
+    pub(crate) drawing: ign_render::Recipe,
     pub(crate) effects: EffectsChoice,
+    pub(crate) effects_net: EffectsNet,
+    pub(crate) head: Head,
+    pub(crate) loss: Loss,
+    /// Whether the networks of preset `standard` train in bfloat16, with weights, sums and colours in single precision.
+    pub(crate) bf16: bool,
+    /// Whether a training view that is a reference is blended from the others alone.
+    pub(crate) leave_out: bool,
+    /// Whether the blending head sees the views of a pixel in random order while it trains.
+    pub(crate) shuffle: bool,
+    /// Whether the painting head is trained against a discriminator.
+    pub(crate) adversarial: bool,
+    /// Decay of the average of weights that is kept; 0: the last weights are.
+    pub(crate) average_decay: f64,
+    /// Whether the learning rate stays the same to the end.
+    pub(crate) constant_rate: bool,
     pub(crate) effects_steps: u64,
     /// Observations per step of the point effects.
     pub(crate) effects_batch: i64,
@@ -155,6 +250,8 @@ pub(crate) struct Settings {
     pub(crate) half_weights: bool,
     pub(crate) checkpoint_secs: f64,
     pub(crate) margin: f64,
+    /// Whether the proxy's outline is brought to the masks.
+    pub(crate) fit: bool,
     /// Whether the proxy may be simplified where no view shows the difference.
     pub(crate) simplify: bool,
     pub(crate) gains: GainsChoice,
@@ -189,15 +286,39 @@ impl Recipe {
         let epochs = |count: u64| count * train_views.min(most) as u64;
         let mut settings = Settings {
             preset: self.preset,
+            quality: Quality::Standard,
+            target_psnr: None,
+            max_secs: None,
+            max_bundle_mb: None,
+            min_render_fps: None,
+            compose: true,
             k: 4,
             train_views: MOST_VIEWS,
             references: 20,
             supersample: if paper { 1 } else { 2 },
+            drawing: if paper {
+                ign_render::Recipe::Paper
+            } else {
+                ign_render::Recipe::Standard
+            },
             effects: if paper {
                 EffectsChoice::On
             } else {
                 EffectsChoice::Auto
             },
+            effects_net: if paper {
+                EffectsNet::UNet
+            } else {
+                EffectsNet::Points
+            },
+            head: if paper { Head::Paint } else { Head::Blend },
+            loss: if paper { Loss::L1 } else { Loss::Mixed },
+            bf16: false,
+            leave_out: !paper,
+            shuffle: !paper,
+            adversarial: true,
+            average_decay: if paper { 0.0 } else { 0.995 },
+            constant_rate: paper,
             effects_steps: if paper { epochs(64) } else { 2000 },
             effects_batch: 8192,
             composition_steps: if paper { epochs(64) } else { 1000 },
@@ -207,12 +328,27 @@ impl Recipe {
             half_weights: false,
             checkpoint_secs: 20.0,
             margin: 0.05,
+            fit: true,
             simplify: true,
             gains: GainsChoice::Auto,
             preview_frames: 36,
         };
         for (key, value) in &self.settings {
             settings.set(key, value)?;
+        }
+        if self.preset == Preset::Auto {
+            let longest = |steps: u64| (steps as f64 * settings.quality.most()).ceil() as u64;
+            settings.effects_steps = longest(settings.effects_steps);
+            settings.composition_steps = longest(settings.composition_steps);
+        } else if let Some(key) = self
+            .settings
+            .keys()
+            .find(|key| AUTO_ONLY.contains(&key.as_str()))
+        {
+            return Err(invalid(
+                format!("{key} needs preset auto"),
+                "leave it out, or use preset auto: the others have a fixed length and size",
+            ));
         }
         if paper && settings.compares(Method::Paper) {
             return Err(invalid(
@@ -225,6 +361,33 @@ impl Recipe {
 }
 
 impl Settings {
+    /// What layers compute in while they train.
+    pub(crate) fn kind(&self) -> Kind {
+        if self.bf16 {
+            Kind::BFloat16
+        } else {
+            Kind::Float
+        }
+    }
+
+    /// How the networks of `ours` learn; `enough` is the error at which more is not wanted.
+    pub(crate) fn rate(&self, enough: Option<f64>) -> Rate {
+        match self.preset {
+            Preset::Auto => Rate::WhileItPays(Worth {
+                least_gain: self.quality.least_gain(),
+                enough,
+            }),
+            _ if self.constant_rate => Rate::Constant,
+            _ => Rate::Falling,
+        }
+    }
+
+    /// The mean squared error on [0, 255] of [`Self::target_psnr`].
+    pub(crate) fn enough_mse(&self) -> Option<f64> {
+        self.target_psnr
+            .map(|decibels| 255.0 * 255.0 / 10f64.powf(decibels / 10.0))
+    }
+
     /// Number of methods that train beside ours.
     pub(crate) fn trained_methods(&self) -> usize {
         let cheap = |method: &&Method| !Method::CHEAP.contains(method);
@@ -238,34 +401,62 @@ impl Settings {
 
     fn set(&mut self, key: &str, value: &str) -> Result<(), BakeError> {
         match key {
+            "quality" => {
+                let choices = [
+                    ("draft", Quality::Draft),
+                    ("standard", Quality::Standard),
+                    ("best", Quality::Best),
+                ];
+                self.quality = choice(key, value, &choices)?;
+            }
+            "target_psnr" => self.target_psnr = Some(number(key, value, 5.0, 100.0)?),
+            "max_secs" => self.max_secs = Some(number(key, value, 1.0, 1e7)?),
+            "max_bundle_mb" => self.max_bundle_mb = Some(number(key, value, 0.01, 1e5)?),
+            "min_render_fps" => self.min_render_fps = Some(number(key, value, 1e-3, 1e4)?),
             "k" => self.k = number(key, value, 1, 16)?,
             "train_views" => self.train_views = train_views_setting(value)?,
             "references" => self.references = number(key, value, 1, 64)?,
             "supersample" => self.supersample = number(key, value, 1, 4)?,
+            "drawing" => {
+                let choices = [
+                    ("paper", ign_render::Recipe::Paper),
+                    ("standard", ign_render::Recipe::Standard),
+                ];
+                self.drawing = choice(key, value, &choices)?;
+            }
             "effects" => {
-                self.effects = match value {
-                    "auto" => EffectsChoice::Auto,
-                    "on" => EffectsChoice::On,
-                    "off" => EffectsChoice::Off,
-                    _ => {
-                        return Err(invalid(
-                            format!("effects={value} is unknown"),
-                            "use auto, on or off",
-                        ));
-                    }
-                }
+                let choices = [
+                    ("auto", EffectsChoice::Auto),
+                    ("on", EffectsChoice::On),
+                    ("off", EffectsChoice::Off),
+                ];
+                self.effects = choice(key, value, &choices)?;
+            }
+            "effects_net" => {
+                let choices = [("points", EffectsNet::Points), ("unet", EffectsNet::UNet)];
+                self.effects_net = choice(key, value, &choices)?;
+            }
+            "head" => {
+                self.head = choice(
+                    key,
+                    value,
+                    &[("blend", Head::Blend), ("paint", Head::Paint)],
+                )?;
+            }
+            "loss" => self.loss = choice(key, value, &[("l1", Loss::L1), ("mixed", Loss::Mixed)])?,
+            "precision" => {
+                self.bf16 = choice(key, value, &[("fp32", false), ("bf16", true)])?;
+            }
+            "leave_out" => self.leave_out = switch(key, value)?,
+            "shuffle" => self.shuffle = switch(key, value)?,
+            "adversarial" => self.adversarial = switch(key, value)?,
+            "average_decay" => self.average_decay = number(key, value, 0.0, 0.999_999)?,
+            "rate" => {
+                self.constant_rate = choice(key, value, &[("constant", true), ("falling", false)])?;
             }
             "gains" => {
-                self.gains = match value {
-                    "auto" => GainsChoice::Auto,
-                    "off" => GainsChoice::Off,
-                    _ => {
-                        return Err(invalid(
-                            format!("gains={value} is unknown"),
-                            "use auto or off",
-                        ));
-                    }
-                }
+                let choices = [("auto", GainsChoice::Auto), ("off", GainsChoice::Off)];
+                self.gains = choice(key, value, &choices)?;
             }
             "effects_steps" => self.effects_steps = number(key, value, 1, 10_000_000)?,
             "effects_batch" => self.effects_batch = number(key, value, 64, 1 << 20)?,
@@ -276,13 +467,16 @@ impl Settings {
             "half_weights" => self.half_weights = switch(key, value)?,
             "checkpoint_secs" => self.checkpoint_secs = number(key, value, 0.0, 86_400.0)?,
             "margin" => self.margin = number(key, value, 0.0, 2.0)?,
+            "fit" => self.fit = switch(key, value)?,
             "simplify" => self.simplify = switch(key, value)?,
             "preview_frames" => self.preview_frames = number(key, value, 1, 360)?,
             _ => {
                 return Err(invalid(
                     format!("setting {key} is unknown"),
-                    "known: k, train_views, references, supersample, effects, effects_steps, effects_batch, composition_steps, \
-                     batch, patch, methods, half_weights, checkpoint_secs, margin, gains, simplify, preview_frames",
+                    "known: k, train_views, references, supersample, drawing, effects, effects_net, head, loss, leave_out, shuffle, precision, adversarial, \
+                     average_decay, rate, effects_steps, effects_batch, composition_steps, \
+                     batch, patch, methods, half_weights, checkpoint_secs, margin, gains, fit, simplify, preview_frames, quality, \
+                     target_psnr, max_secs, max_bundle_mb, min_render_fps",
                 ));
             }
         }
@@ -295,6 +489,17 @@ fn invalid(message: String, hint: &str) -> BakeError {
         message,
         hint: hint.into(),
     }
+}
+
+fn choice<T: Copy>(key: &str, value: &str, choices: &[(&str, T)]) -> Result<T, BakeError> {
+    let chosen = choices.iter().find(|(name, _)| *name == value);
+    chosen.map(|(_, choice)| *choice).ok_or_else(|| {
+        let names: Vec<&str> = choices.iter().map(|(name, _)| *name).collect();
+        invalid(
+            format!("{key}={value} is unknown"),
+            &format!("use {}", names.join(" or ")),
+        )
+    })
 }
 
 fn train_views_setting(value: &str) -> Result<usize, BakeError> {

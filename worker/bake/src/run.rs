@@ -1,6 +1,7 @@
 //! The stages of a bake, in order.
 
 use std::path::PathBuf;
+use std::time::Instant;
 
 use ign_bundle::metrics::{Metrics, SCHEMA, ViewCounts};
 use ign_capture::{Gains, ImportError, ImportOptions, Preflight, PreflightOptions, Survey};
@@ -13,9 +14,10 @@ use crate::compare::{self, Rivals};
 use crate::data::{Dataset, Scored};
 use crate::divergence::Fallback;
 use crate::pack::{Finished, pack};
+use crate::plan;
 use crate::progress::Reporter;
 use crate::recipe::{GainsChoice, Recipe};
-use crate::training::{Drawn, Trainer};
+use crate::training::Trainer;
 
 /// What to bake, and where.
 #[derive(Clone, Debug)]
@@ -41,7 +43,7 @@ pub struct BakeJob {
 /// # Errors
 /// See [`BakeError`]; its [`BakeError::failure`] says whether trying again can help.
 pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError> {
-    let started_at = chrono::Utc::now();
+    let (started_at, started) = (chrono::Utc::now(), Instant::now());
     let reporter = Reporter::new(events);
     ign_nets::device::limit_threads(job.threads);
     let device = ign_nets::select_device();
@@ -56,7 +58,7 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         proxy: asked.proxy.clone(),
     };
     let scene = ign_capture::import(&job.capture_dir, &options)?;
-    let settings = job.recipe.resolve(scene.train.len())?;
+    let mut settings = job.recipe.resolve(scene.train.len())?;
     reporter.expect(settings.trained_methods());
     reporter.step(0.2, "comparing the photographs at common surface points");
     let survey = Survey::new(&scene);
@@ -91,24 +93,38 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         job.checkpoint.as_deref(),
     )?;
 
-    reporter.stage("plan", "choosing reference views");
+    reporter.stage("plan", "fitting the proxy to the masks");
+    let fitted = data.fit_proxy(settings.fit)?;
+    reporter.step(0.1, "choosing reference views");
     // On the proxy as given: what a view covers must not hang on how coarse a proxy suffices.
     let chosen = data.choose_references(settings.references);
-    reporter.step(0.2, "fitting the proxy to the views");
+    reporter.step(0.2, "simplifying the proxy where no view shows it");
     data.settle_proxy(settings.simplify);
     reporter.info(data.proxy_words.clone());
-    let data = data;
+    if let Some(words) = &fitted {
+        reporter.info(words.clone());
+    }
     reporter.step(0.4, "loading validation and held-out views");
-    let scale = data.reference_scale;
-    let drawn = Drawn::new(&data, &chosen, data.settings.clone(), scale)?;
+    let fit = plan::fit(&mut data, &mut settings, chosen, &mut session)?;
+    let (data, settings, drawn, chosen) = (data, settings, fit.drawn, fit.chosen);
+    let left = settings
+        .max_secs
+        .map(|most| plan::training_secs(&data, &settings, &drawn, started, most));
     let trainer = Trainer {
-        recipe: &job.recipe,
         settings: &settings,
         data: &data,
         drawn: &drawn,
+        seed: job.recipe.seed,
+        budget_secs: left
+            .into_iter()
+            .chain(job.recipe.budget_secs)
+            .reduce(f64::min),
     };
     let (ours, mut plan) = trainer.ours(&mut session)?;
     let rivals = Rivals::train(&trainer, &mut session, &ours, &chosen)?;
+    for sentence in fitted.into_iter().chain(fit.words) {
+        say(&mut plan, sentence);
+    }
     note_capture(&mut plan, &preflight, &gains);
     note_fallbacks(&mut plan, session.fallbacks());
 

@@ -1,4 +1,8 @@
-//! What is trained for `ours`, by preset.
+//! Training of both networks as the settings say; presets are nothing but settings.
+//!
+//! Two forms of each network: `EffectsNet` per surface point or as the paper's U-Net, `CompositionNet` with the blending
+//! head or as the paper's painter. `EffectsNet` is kept where it lowers the error of plain blending on validation views;
+//! with preset `auto`, `CompositionNet` too, and both train for as long as that pays.
 
 use ign_bundle::metrics::SpeedError;
 use ign_nets::composition::{BlendComposition, PaperComposition};
@@ -7,25 +11,45 @@ use ign_render::{Composition, Effects, Model, ReferenceImage, References, Render
 use rayon::prelude::*;
 use serde_json::json;
 
-use crate::checkpoint::{Schedule, Session};
+use crate::checkpoint::Session;
 use crate::composition::{self, GeneratorInput, Plan, Views};
 use crate::data::{Dataset, Scored};
-use crate::recipe::{EffectsChoice, Preset, Recipe, Settings};
+use crate::recipe::{EffectsChoice, EffectsNet, Head, Preset, Settings};
+use crate::schedule::Schedule;
 use crate::{BakeError, effects};
 
 /// Effects stay when they lower the validation error of plain blending by at least this share.
 const EFFECTS_GAIN: f64 = 0.03;
-/// Share of a time budget that effects get.
+/// With preset `auto`, `CompositionNet` stays when it lowers the validation error by at least this share.
+const COMPOSITION_GAIN: f64 = 0.03;
+/// Share of a time budget that effects get: per surface point, and of the paper's network, whose step costs about half of
+/// its `CompositionNet`'s.
 const EFFECTS_SHARE: f64 = 0.25;
-/// Paper: 64 epochs for each network.
-const PAPER_EPOCHS: u64 = 64;
-/// Share of a time budget that the paper's `EffectsNet` gets: its step costs about half of a `CompositionNet` step.
 const PAPER_EFFECTS_SHARE: f64 = 0.3;
 
-const COMPOSITION: &str = "composition";
-const COMPOSITION_NO_EFFECTS: &str = "composition_no_effects";
-const PAPER_EFFECTS: &str = "paper_effects";
-const PAPER_COMPOSITION: &str = "paper_composition";
+/// What one training is called: its row of metrics.json, and its stages in checkpoints.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Names {
+    pub(crate) method: &'static str,
+    pub(crate) effects: &'static str,
+    pub(crate) composition: &'static str,
+}
+
+pub(crate) const OURS: Names = Names {
+    method: "ours",
+    effects: "effects",
+    composition: "composition",
+};
+pub(crate) const OURS_NO_EFFECTS: Names = Names {
+    method: "ours_no_effects",
+    effects: "effects_no_effects",
+    composition: "composition_no_effects",
+};
+pub(crate) const PAPER: Names = Names {
+    method: "paper",
+    effects: "paper_effects",
+    composition: "paper_composition",
+};
 
 /// Networks and what they took.
 pub(crate) struct Trained {
@@ -82,275 +106,309 @@ impl Drawn {
 
 /// Everything that training needs.
 pub(crate) struct Trainer<'a> {
-    pub(crate) recipe: &'a Recipe,
     pub(crate) settings: &'a Settings,
     pub(crate) data: &'a Dataset<'a>,
-    /// As the recipe's preset has it.
+    /// As the settings have it.
     pub(crate) drawn: &'a Drawn,
+    pub(crate) seed: u64,
+    /// Seconds of training at most, both networks together.
+    pub(crate) budget_secs: Option<f64>,
+}
+
+/// One network: whether it is in the bundle, and why.
+struct Decision {
+    kept: bool,
+    gain: Option<f64>,
+    words: String,
 }
 
 impl Trainer<'_> {
-    /// The paper's 64 epochs.
-    pub(crate) fn epochs(&self) -> u64 {
-        PAPER_EPOCHS * self.data.train.len() as u64
-    }
-
     /// Trains `ours`; the plan says what was tried, measured, kept and why.
     pub(crate) fn ours(
         &self,
         session: &mut Session<'_>,
     ) -> Result<(Trained, serde_json::Value), BakeError> {
-        match self.settings.preset {
-            Preset::Standard => self.standard(session),
-            Preset::Paper => {
-                session
-                    .reporter
-                    .stage("composition", "training the paper's networks");
-                let steps = (self.settings.effects_steps, self.settings.composition_steps);
-                let budget = self.recipe.budget_secs;
-                let trained = self.paper(session, self.drawn, steps, budget, "ours")?;
-                let plan = json!({
-                    "preset": "paper",
-                    "references": self.drawn.images.len(),
-                    "k": self.settings.k,
-                    "words": [
-                        self.data.proxy_words,
-                        "The paper's networks, losses and schedule as published; nothing was measured or left out.",
-                    ],
-                });
-                Ok((trained, plan))
-            }
+        let (trained, effects, composition) = self.both(session, OURS)?;
+        let (settings, references) = (self.settings, self.drawn.images.len());
+        let plan = json!({
+            "preset": settings.preset,
+            "references": references,
+            "k": self.drawn.settings.k,
+            "effects_kept": effects.kept,
+            "effects_gain": effects.gain,
+            "effects_least_gain": EFFECTS_GAIN,
+            "effects_steps": session.steps(OURS.effects),
+            "composition_kept": composition.kept,
+            "composition_gain": composition.gain,
+            "composition_steps": session.steps(OURS.composition),
+            "measured": session.measurements(),
+            "words": [
+                self.data.proxy_words,
+                format!(
+                    "{references} reference views were chosen by coverage; each target view blends {} of them.",
+                    self.drawn.settings.k
+                ),
+                effects.words,
+                composition.words,
+            ],
+        });
+        Ok((trained, plan))
+    }
+
+    /// Trains both networks, each unless a checkpoint already has it.
+    pub(crate) fn train(
+        &self,
+        session: &mut Session<'_>,
+        names: Names,
+    ) -> Result<Trained, BakeError> {
+        let (trained, ..) = self.both(session, names)?;
+        Ok(trained)
+    }
+
+    fn both(
+        &self,
+        session: &mut Session<'_>,
+        names: Names,
+    ) -> Result<(Trained, Decision, Decision), BakeError> {
+        let share = match self.settings.effects_net {
+            EffectsNet::Points => EFFECTS_SHARE,
+            EffectsNet::UNet => PAPER_EFFECTS_SHARE,
+        };
+        let plain = self.drawn.plain(self.data);
+        if self.settings.effects != EffectsChoice::Off {
+            self.begin(session, names, "effects", (0.0, share));
+        }
+        let (model, effects) = self.with_effects(session, plain, names, share)?;
+        self.begin(session, names, "composition", (share, 1.0));
+        let (model, composition) = self.with_composition(session, model, names, share)?;
+        let secs = session.secs(names.effects) + session.secs(names.composition);
+        Ok((Trained { model, secs }, effects, composition))
+    }
+
+    /// Begins a stage of the bake for `ours`, a part of the present one for what is compared with it.
+    fn begin(
+        &self,
+        session: &Session<'_>,
+        names: Names,
+        stage: &'static str,
+        (from, to): (f64, f64),
+    ) {
+        if names.method == OURS.method {
+            let message = format!("training {}Net", capitalised(stage));
+            session.reporter.stage(stage, &message);
+        } else {
+            session.reporter.part(from, to);
         }
     }
 
-    /// Preset `standard`: effects when they pay, then the blending head.
-    fn standard(
+    /// Error of plain blending with the model's effects on the validation views; measured once.
+    fn blending_error(&self, session: &mut Session<'_>, name: &str, model: &Model) -> f64 {
+        session.measured(name, || {
+            composition::prior_errors(model, &self.drawn.validation).map_or(0.0, |(full, _)| full)
+        })
+    }
+
+    /// Adds effects where they pay.
+    fn with_effects(
         &self,
         session: &mut Session<'_>,
-    ) -> Result<(Trained, serde_json::Value), BakeError> {
-        let (data, settings, reporter) = (self.data, self.settings, session.reporter);
-        let plain = self.drawn.plain(data);
-        let prior_error = |model: &Model| {
-            composition::prior_errors(model, &self.drawn.validation).map_or(0.0, |(full, _)| full)
-        };
-        let plain_mse = session.measured("plain_mse", || prior_error(&plain));
-        reporter.error(plain_mse);
-        reporter.info(format!(
-            "plain blending of {} references: validation error {plain_mse:.2}",
-            settings.k
-        ));
-        if session.curve().is_empty()
-            && let Some((mse, mse_object)) = composition::prior_errors(&plain, &self.drawn.held_out)
-        {
+        plain: Model,
+        names: Names,
+        share: f64,
+    ) -> Result<(Model, Decision), BakeError> {
+        let (data, settings) = (self.data, self.settings);
+        let plain_mse = self.blending_error(session, &measure(names, "plain_mse"), &plain);
+        session.reporter.error(plain_mse);
+        if settings.head == Head::Blend && !session.has_curve(names.method) {
+            let (mse, mse_object) =
+                composition::prior_errors(&plain, &self.drawn.held_out).unwrap_or_default();
             session.curve_point(SpeedError {
-                method: "ours".into(),
+                method: names.method.into(),
                 secs: 0.0,
                 mse,
                 mse_object,
             });
         }
-
-        let mut with_effects = None;
-        let mut effects_mse = None;
-        if settings.effects != EffectsChoice::Off {
-            reporter.stage("effects", "training EffectsNet");
-            if !session.finished(effects::STAGE) {
-                let schedule = Schedule {
-                    steps: settings.effects_steps,
-                    budget_secs: self.recipe.budget_secs.map(|secs| secs * EFFECTS_SHARE),
-                };
-                effects::train_points(
-                    data,
-                    session,
-                    schedule,
-                    (self.recipe.seed, settings.effects_batch),
-                )?;
-            }
-            let (net, params) = session.restore(effects::STAGE, data.device, PointEffects::new)?;
-            let effects = Effects::Points(net, params);
-            let model = self.drawn.plain(data).with_effects(Some(effects));
-            let mse = session.measured("effects_mse", || prior_error(&model));
-            reporter.info(format!(
-                "plain blending with effects removed and re-inserted: validation error {mse:.2}"
-            ));
-            effects_mse = Some(mse);
-            with_effects = Some(model);
+        if settings.effects == EffectsChoice::Off {
+            let decision = Decision {
+                kept: false,
+                gain: None,
+                words: "EffectsNet was switched off by the recipe.".into(),
+            };
+            return Ok((plain, decision));
         }
-        let gain = effects_mse.map(|mse| 1.0 - mse / plain_mse.max(1e-9));
-        let keep = match settings.effects {
-            EffectsChoice::On => true,
-            EffectsChoice::Off => false,
-            EffectsChoice::Auto => gain.is_some_and(|gain| gain >= EFFECTS_GAIN),
+        if !session.finished(names.effects) {
+            let schedule = Schedule {
+                steps: settings.effects_steps,
+                budget_secs: self.budget_secs.map(|secs| secs * share),
+                rate: settings.rate(None),
+            };
+            let plan = effects::Plan {
+                stage: names.effects,
+                schedule,
+                seed: self.seed,
+                batch: settings.effects_batch,
+                average_decay: settings.average_decay,
+                kind: settings.kind(),
+            };
+            match settings.effects_net {
+                EffectsNet::Points => effects::train_points(data, session, &plan)?,
+                EffectsNet::UNet => {
+                    effects::train_paper(data, session, &plan, &self.drawn.settings)?;
+                }
+            }
+        }
+        let effects = match settings.effects_net {
+            EffectsNet::Points => {
+                let (net, params) =
+                    session.restore(names.effects, data.device, PointEffects::new)?;
+                Effects::Points(net, params)
+            }
+            EffectsNet::UNet => {
+                let (net, params) =
+                    session.restore(names.effects, data.device, PaperEffects::new)?;
+                Effects::Paper(net, params)
+            }
         };
-        let words = match effects_mse {
-            Some(mse) if keep => format!(
+        let model = self.drawn.plain(data).with_effects(Some(effects));
+        let mse = self.blending_error(session, &measure(names, "effects_mse"), &model);
+        let gain = 1.0 - mse / plain_mse.max(1e-9);
+        let kept = settings.effects == EffectsChoice::On || gain >= EFFECTS_GAIN;
+        let words = match settings.effects {
+            EffectsChoice::On => format!(
+                "EffectsNet is in the bundle because the recipe says so; it takes the error of plain blending on validation \
+                 views from {plain_mse:.1} to {mse:.1}."
+            ),
+            _ if kept => format!(
                 "Colours change with the viewpoint: removing and re-inserting learned effects takes the error of plain \
                  blending from {plain_mse:.1} to {mse:.1} on validation views, so EffectsNet is part of the bundle."
             ),
-            Some(mse) => format!(
+            _ => format!(
                 "Colours hardly change with the viewpoint: plain blending has an error of {plain_mse:.1} on validation \
                  views, with learned effects {mse:.1}; the bundle has no EffectsNet."
             ),
-            None => "EffectsNet was switched off by the recipe.".to_owned(),
         };
-        reporter.info(words.clone());
-
-        reporter.stage("composition", "training CompositionNet");
-        let effects_secs = session.secs(effects::STAGE);
-        let budget = self.recipe.budget_secs;
-        let budget = budget.map(|secs| (secs - effects_secs).max(secs * (1.0 - EFFECTS_SHARE)));
-        let model = with_effects.filter(|_| keep).unwrap_or(plain);
-        let model = self.blend(session, model, COMPOSITION, "ours", budget, effects_secs)?;
-        let secs = effects_secs + session.secs(COMPOSITION);
-        let plan = json!({
-            "preset": "standard",
-            "references": self.drawn.images.len(),
-            "k": settings.k,
-            "effects_kept": keep,
-            "effects_gain": gain,
-            "effects_least_gain": EFFECTS_GAIN,
-            "measured": session.measurements(),
-            "words": [
-                data.proxy_words,
-                format!("{} reference views were chosen by coverage; each target view blends {} of them.", self.drawn.images.len(), settings.k),
-                words,
-            ],
-        });
-        Ok((Trained { model, secs }, plan))
+        session.reporter.info(words.clone());
+        let decision = Decision {
+            kept,
+            gain: Some(gain),
+            words,
+        };
+        Ok((if kept { model } else { plain }, decision))
     }
 
-    /// Trains a blending head for the model's effects, unless a checkpoint already has it.
+    /// Adds the `CompositionNet` for the model's effects; with preset `auto`, where it pays.
+    fn with_composition(
+        &self,
+        session: &mut Session<'_>,
+        mut model: Model,
+        names: Names,
+        share: f64,
+    ) -> Result<(Model, Decision), BakeError> {
+        let settings = self.settings;
+        let prior_mse = self.blending_error(session, &measure(names, "prior_mse"), &model);
+        if !settings.compose {
+            let decision = Decision {
+                kept: false,
+                gain: None,
+                words: "There is no CompositionNet, for rendering to be as fast as asked.".into(),
+            };
+            return Ok((model, decision));
+        }
+        let effects_secs = session.secs(names.effects);
+        // Time that the effects did not need, and all of it where there are none; more than its share if they took too much.
+        let budget_secs = self
+            .budget_secs
+            .map(|secs| (secs - effects_secs).max(secs * (1.0 - share)));
+        let plan = Plan {
+            stage: names.composition,
+            method: names.method,
+            schedule: Schedule {
+                steps: settings.composition_steps,
+                budget_secs,
+                rate: settings.rate(settings.enough_mse()),
+            },
+            seed: self.seed,
+            secs_before: effects_secs,
+        };
+        model.composition = Some(match settings.head {
+            Head::Blend => self.blend(session, &model, &plan)?,
+            Head::Paint => self.paint(session, &model, &plan)?,
+        });
+        let mse = session.measured(&measure(names, "composed_mse"), || {
+            composition::rendered_error(&model, &self.drawn.validation).unwrap_or(0.0)
+        });
+        let gain = 1.0 - mse / prior_mse.max(1e-9);
+        let kept = settings.preset != Preset::Auto || gain >= COMPOSITION_GAIN;
+        let taken = format!(
+            "CompositionNet takes the error of blending on validation views from {prior_mse:.2} to {mse:.2}"
+        );
+        let words = if kept {
+            format!("{taken}.")
+        } else {
+            model.composition = None;
+            format!("{taken} only: the bundle has none.")
+        };
+        session.reporter.info(words.clone());
+        let decision = Decision {
+            kept,
+            gain: Some(gain),
+            words,
+        };
+        Ok((model, decision))
+    }
+
     fn blend(
         &self,
         session: &mut Session<'_>,
-        mut model: Model,
-        stage: &'static str,
-        method: &'static str,
-        budget_secs: Option<f64>,
-        secs_before: f64,
-    ) -> Result<Model, BakeError> {
-        if !session.finished(stage) {
-            let plan = Plan {
-                stage,
-                method,
-                schedule: Schedule {
-                    steps: self.settings.composition_steps,
-                    budget_secs,
-                },
-                seed: self.recipe.seed,
-                secs_before,
-            };
-            let patch = self.settings.patch.min(i64::from(self.recipe.size));
-            let windows = (self.settings.batch, patch);
-            composition::train_blend(
-                self.data,
-                session,
-                &model,
-                &plan,
-                windows,
-                self.drawn.views(),
-            )?;
-        }
-        let k = self.settings.k;
-        let (net, params) =
-            session.restore(stage, self.data.device, |b| BlendComposition::new(b, k))?;
-        model.composition = Some(Composition::Blend(net, params));
-        Ok(model)
-    }
-
-    /// `ours` as it is without `EffectsNet`, within `budget_secs`.
-    pub(crate) fn without_effects(
-        &self,
-        session: &mut Session<'_>,
-        budget_secs: Option<f64>,
-    ) -> Result<Trained, BakeError> {
-        let (stage, method) = (COMPOSITION_NO_EFFECTS, "ours_no_effects");
-        let plain = self.drawn.plain(self.data);
-        let model = match self.settings.preset {
-            Preset::Standard => self.blend(session, plain, stage, method, budget_secs, 0.0)?,
-            Preset::Paper => {
-                let plan = Plan {
-                    stage,
-                    method,
-                    schedule: Schedule {
-                        steps: self.settings.composition_steps,
-                        budget_secs,
-                    },
-                    seed: self.recipe.seed,
-                    secs_before: 0.0,
-                };
-                self.paper_composition(session, self.drawn, plain, &plan)?
-            }
-        };
-        Ok(Trained {
-            model,
-            secs: session.secs(stage),
-        })
-    }
-
-    /// The paper's networks on views that are drawn the paper's way: (effects, composition) steps, within `budget`.
-    pub(crate) fn paper(
-        &self,
-        session: &mut Session<'_>,
-        drawn: &Drawn,
-        (effects_steps, composition_steps): (u64, u64),
-        budget: Option<f64>,
-        method: &'static str,
-    ) -> Result<Trained, BakeError> {
-        let data = self.data;
-        session.reporter.part(0.0, PAPER_EFFECTS_SHARE);
-        if !session.finished(PAPER_EFFECTS) {
-            let schedule = Schedule {
-                steps: effects_steps,
-                budget_secs: budget.map(|secs| secs * PAPER_EFFECTS_SHARE),
-            };
-            let (settings, seed) = (&drawn.settings, self.recipe.seed);
-            effects::train_paper(data, session, PAPER_EFFECTS, settings, schedule, seed)?;
-        }
-        let (net, params) = session.restore(PAPER_EFFECTS, data.device, PaperEffects::new)?;
-        let model = drawn
-            .plain(data)
-            .with_effects(Some(Effects::Paper(net, params)));
-        session.reporter.part(PAPER_EFFECTS_SHARE, 1.0);
-        let effects_secs = session.secs(PAPER_EFFECTS);
-        let plan = Plan {
-            stage: PAPER_COMPOSITION,
-            method,
-            schedule: Schedule {
-                steps: composition_steps,
-                budget_secs: budget.map(|secs| secs * (1.0 - PAPER_EFFECTS_SHARE)),
-            },
-            seed: self.recipe.seed,
-            secs_before: effects_secs,
-        };
-        let model = self.paper_composition(session, drawn, model, &plan)?;
-        Ok(Trained {
-            model,
-            secs: effects_secs + session.secs(PAPER_COMPOSITION),
-        })
-    }
-
-    /// The paper's `CompositionNet` for the model's effects, unless a checkpoint already has it.
-    fn paper_composition(
-        &self,
-        session: &mut Session<'_>,
-        drawn: &Drawn,
-        mut model: Model,
+        model: &Model,
         plan: &Plan,
-    ) -> Result<Model, BakeError> {
-        let channels = PaperComposition::input_channels(drawn.settings.k);
+    ) -> Result<Composition, BakeError> {
+        if !session.finished(plan.stage) {
+            composition::train_blend(self.data, session, model, plan, self.settings, self.drawn)?;
+        }
+        let k = self.drawn.settings.k;
+        let (net, params) = session.restore(plan.stage, self.data.device, |b| {
+            BlendComposition::new(b, k)
+        })?;
+        Ok(Composition::Blend(net, params))
+    }
+
+    fn paint(
+        &self,
+        session: &mut Session<'_>,
+        model: &Model,
+        plan: &Plan,
+    ) -> Result<Composition, BakeError> {
+        let channels = PaperComposition::input_channels(self.drawn.settings.k);
         if !session.finished(plan.stage) {
             let input = GeneratorInput {
                 channels,
                 of: &|target| model.paper_input(target),
-                settings: &drawn.settings,
+                settings: &self.drawn.settings,
+                adversarial: self.settings.adversarial,
             };
-            composition::train_generator(self.data, session, &input, plan, drawn.views())?;
+            composition::train_generator(self.data, session, &input, plan, self.drawn.views())?;
         }
         let (net, params) = session.restore(plan.stage, self.data.device, |b| {
             PaperComposition::new(b, channels)
         })?;
-        model.composition = Some(Composition::Paper(net, params));
-        Ok(model)
+        Ok(Composition::Paper(net, params))
     }
+}
+
+/// A figure's name: those of `ours` are known by it alone.
+fn measure(names: Names, figure: &str) -> String {
+    if names.method == OURS.method {
+        figure.to_owned()
+    } else {
+        format!("{}_{figure}", names.method)
+    }
+}
+
+fn capitalised(word: &str) -> String {
+    let mut letters = word.chars();
+    letters.next().map_or_else(String::new, |first| {
+        first.to_uppercase().chain(letters).collect()
+    })
 }

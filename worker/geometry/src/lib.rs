@@ -16,6 +16,7 @@ mod mesh;
 mod neighbours;
 mod raster;
 pub mod select;
+pub mod silhouette;
 pub mod simplify;
 mod surface;
 mod warp;

@@ -73,6 +73,19 @@ impl BlendInput {
         }
     }
 
+    /// The candidates in another order: `order` holds each of 0 to K - 1 once.
+    #[must_use]
+    pub fn reordered(&self, order: &[i64]) -> Self {
+        let order = Tensor::from_slice(order).to_device(self.prior.device());
+        let by_order = |t: &Tensor| t.index_select(1, &order);
+        Self {
+            candidates: by_order(&self.candidates),
+            prior: by_order(&self.prior),
+            visibility: by_order(&self.visibility),
+            target: self.target.shallow_clone(),
+        }
+    }
+
     /// Stacks inputs of one size along the batch.
     pub fn batch(inputs: &[Self]) -> Self {
         let cat = |pick: fn(&Self) -> &Tensor| {
@@ -147,7 +160,8 @@ impl BlendComposition {
         })
     }
 
-    /// -> [B, 3, H, W], encoded sRGB, in [0, 1] up to the generated layer's small overshoot.
+    /// -> [B, 3, H, W], encoded sRGB, in [0, 1] up to the generated layer's small overshoot. Layers compute in the kind of
+    /// `params`, colours are blended in that of `input`.
     ///
     /// # Panics
     /// When the input's tensors do not have the shapes that [`BlendInput`] names.
@@ -174,7 +188,9 @@ impl BlendComposition {
         );
         let step = 1i64 << self.down.len();
         let pad = |n: i64| (step - n % step) % step;
-        let x = x.constant_pad_nd([0, pad(width), 0, pad(height)]);
+        let x = x
+            .constant_pad_nd([0, pad(width), 0, pad(height)])
+            .to_kind(params.kind());
         let mut x = activate(&self.stem.forward(params, &x));
         let mut skips = Vec::new();
         for (first, second) in &self.down {
@@ -194,7 +210,8 @@ impl BlendComposition {
             .head
             .forward(params, &x)
             .narrow(2, 0, height)
-            .narrow(3, 0, width);
+            .narrow(3, 0, width)
+            .to_kind(input.candidates.kind());
         let seen = input.visibility.gt(0.0).to_kind(input.candidates.kind());
         let logits = (&input.prior + 1e-4).log() + out.narrow(1, 0, self.k) + (seen - 1.0) * 1e4;
         let generated_logit = out.narrow(1, self.k, 1) + GENERATED_LOGIT;

@@ -83,7 +83,7 @@ impl PointEffects {
     }
 
     /// `points`, `normals`, `to_viewer`: [P, 3] in the normalised frame, the latter two unit -> effects [P, 3], linear
-    /// light, not negative.
+    /// light, not negative. Layers compute in the kind of `params`.
     pub fn forward(
         &self,
         params: &Params,
@@ -101,14 +101,15 @@ impl PointEffects {
                 cosine,
             ],
             1,
-        );
+        )
+        .to_kind(params.kind());
         for (index, (weight, bias)) in self.layers.iter().enumerate() {
             x = x.linear(params.get(*weight), Some(params.get(*bias)));
             if index + 1 < self.layers.len() {
                 x = x.relu();
             }
         }
-        x.softplus()
+        x.to_kind(points.kind()).softplus()
     }
 }
 

@@ -148,14 +148,6 @@ impl Adam {
     }
 }
 
-/// Cosine decay from `peak` to 2 % of it after a linear warm-up over the first 2 %; `fraction` of the training is done.
-pub fn cosine_rate(peak: f64, fraction: f64) -> f64 {
-    let fraction = fraction.clamp(0.0, 1.0);
-    let warm = (fraction / 0.02).clamp(0.05, 1.0);
-    let decay = 0.02 + 0.98 * 0.5 * (1.0 + (std::f64::consts::PI * fraction).cos());
-    peak * warm * decay
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -193,12 +185,5 @@ mod tests {
         assert!(!adam.step(&mut params, 0.1, 1.0));
         assert_eq!(adam.skipped(), 1);
         assert!(params.get(id).double_value(&[0]).abs() < 1e-12);
-    }
-
-    #[test]
-    fn rate_warms_up_then_falls() {
-        assert!(cosine_rate(1.0, 0.0) < 0.06);
-        assert!(cosine_rate(1.0, 0.02) > 0.99);
-        assert!(cosine_rate(1.0, 1.0) < 0.021);
     }
 }

@@ -88,6 +88,11 @@ impl Builder {
         Self::default()
     }
 
+    /// Number of values registered so far.
+    pub fn values(&self) -> i64 {
+        self.next
+    }
+
     /// Registers names below `name.` inside `body`.
     pub fn scope<T>(&mut self, name: &str, body: impl FnOnce(&mut Self) -> T) -> T {
         self.prefix.push(name.to_owned());
@@ -177,6 +182,22 @@ impl Params {
     /// The tensor of `id`.
     pub fn get(&self, id: ParamId) -> &Tensor {
         &self.leaves[id.0]
+    }
+
+    /// The same network computing in `kind`: its tensors are casts of these, which gradients go back through.
+    #[must_use]
+    pub fn in_kind(&self, kind: Kind) -> Self {
+        Self {
+            slots: self.slots.clone(),
+            flat: self.flat.shallow_clone(),
+            trained: self.trained.shallow_clone(),
+            leaves: self.leaves.iter().map(|leaf| leaf.to_kind(kind)).collect(),
+        }
+    }
+
+    /// What layers compute in.
+    pub fn kind(&self) -> Kind {
+        self.leaves.first().map_or(Kind::Float, Tensor::kind)
     }
 
     /// [N] f32: the buffer that all tensors share. Writing to it changes the network.

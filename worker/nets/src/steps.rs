@@ -142,6 +142,15 @@ impl Gan<'_> {
         generator.step(rate, f64::INFINITY);
         loss.double_value(&[])
     }
+
+    /// Trains the generator by the l1 distance alone; returns its loss before the step.
+    pub fn step_alone(&self, generator: &mut Trainee, example: &GanExample<'_>, rate: f64) -> f64 {
+        let image = self.image(&generator.params, example);
+        let loss = losses::l1(&image, example.truth);
+        loss.backward();
+        generator.step(rate, f64::INFINITY);
+        loss.double_value(&[])
+    }
 }
 
 fn judged(example: &GanExample<'_>) -> bool {

@@ -116,11 +116,16 @@ impl Model {
 
     /// Indices of the reference views that a target uses.
     pub fn chosen(&self, target: &Target) -> Vec<usize> {
+        self.chosen_without(target, None)
+    }
+
+    fn chosen_without(&self, target: &Target, hidden: Option<usize>) -> Vec<usize> {
         let mode = match self.settings.recipe {
             Recipe::Paper => Nearest::Coverage,
             Recipe::Standard => Nearest::CoverageAngle,
         };
-        self.references.nearest(target, self.settings.k, mode)
+        self.references
+            .nearest(target, self.settings.k, mode, hidden)
     }
 
     /// Warps the chosen references and re-inserts the target's effects.
@@ -145,7 +150,12 @@ impl Model {
 
     /// What the blending head sees of a target. Missing candidates (fewer references than K) are empty.
     pub fn blend_input(&self, target: &Target) -> BlendInput {
-        let chosen = self.chosen(target);
+        self.blend_input_without(target, None)
+    }
+
+    /// The same as if one of the references, the target's own picture, were not there.
+    pub fn blend_input_without(&self, target: &Target, hidden: Option<usize>) -> BlendInput {
+        let chosen = self.chosen_without(target, hidden);
         let (warped, effects) = self.candidates(target, &chosen);
         let position_normal = target.geometry.narrow(1, 0, 6);
         let missing = self.settings.k.saturating_sub(chosen.len()) as i64;

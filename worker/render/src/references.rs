@@ -149,9 +149,23 @@ impl References {
         self.size
     }
 
-    /// The K nearest views of a target; fewer when there are fewer.
-    pub fn nearest(&self, target: &Target, k: usize, mode: select::Nearest) -> Vec<usize> {
-        select::select_nearest(&target.selection, &self.selection, k, mode)
+    /// The K nearest views of a target, without the `hidden` one; fewer when there are fewer.
+    pub fn nearest(
+        &self,
+        target: &Target,
+        k: usize,
+        mode: select::Nearest,
+        hidden: Option<usize>,
+    ) -> Vec<usize> {
+        let Some(hidden) = hidden else {
+            return select::select_nearest(&target.selection, &self.selection, k, mode);
+        };
+        let mut others = self.selection.clone();
+        others.remove(hidden);
+        select::select_nearest(&target.selection, &others, k, mode)
+            .into_iter()
+            .map(|at| if at < hidden { at } else { at + 1 })
+            .collect()
     }
 
     /// Cross-projects `image` ([V*H*W, 3], one value per reference pixel) of the `chosen` views, weighting each

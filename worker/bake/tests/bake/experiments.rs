@@ -44,6 +44,8 @@ fn rows(dir: &Path, experiment: Experiment, captures: &[PathBuf]) -> (Vec<Value>
         captures: captures.to_vec(),
         recipe: tiny(),
         out: dir.join("out"),
+        seeds: 1,
+        only: vec!["head".into(), "gains".into()],
         threads: 1,
     };
     let files = experiment::run(&job, &|event| {
@@ -162,6 +164,31 @@ fn numbers_of_references_are_compared() {
 }
 
 #[test]
+fn every_change_is_taken_out_and_put_in_alone() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let dir = dir.path();
+    let (rows, bakes) = rows(dir, Experiment::Ablation, &[demo(dir, "vase", None)]);
+    // Two changes on either side of two presets; one row per capture and one over all.
+    assert_eq!((bakes, rows.len()), (6, 4));
+    for row in &rows {
+        assert!(
+            figure(row, "removed_low") <= figure(row, "removed"),
+            "{row}"
+        );
+        assert!(figure(row, "alone") <= figure(row, "alone_high"), "{row}");
+    }
+    let of = |change: &str| {
+        let mut rows = rows.iter();
+        let row = rows.find(|row| row["change"] == change && row["capture"] == "vase");
+        figure(row.unwrap_or_else(|| panic!("no {change}")), "removed")
+    };
+    // After four steps the painter is nowhere near plain blending, which is where the other head starts.
+    assert!(of("blending head") > 2.0, "{rows:?}");
+    // Its photographs are steady.
+    assert!((of("exposure gains") - 1.0).abs() < 1e-3, "{rows:?}");
+}
+
+#[test]
 fn what_an_experiment_lacks_is_named() {
     let dir = tempfile::tempdir().expect("a folder");
     let capture = demo(dir.path(), "vase", None);
@@ -175,6 +202,8 @@ fn what_an_experiment_lacks_is_named() {
             captures,
             recipe: tiny(),
             out: dir.path().join("out"),
+            seeds: 1,
+            only: Vec::new(),
             threads: 1,
         };
         let error = experiment::run(&job, &|_| {}).expect_err("it lacks something");

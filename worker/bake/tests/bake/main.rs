@@ -1,6 +1,7 @@
 //! Whole bakes of tiny captures: the bundle renders what was scored, a resumed bake ends like an unbroken one, bad
 //! settings and hard captures end as they must.
 
+mod auto;
 mod experiments;
 mod gains;
 mod hard;
