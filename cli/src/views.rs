@@ -77,7 +77,9 @@ pub(crate) struct WorkerView {
     pub(crate) version: String,
     pub(crate) device: String,
     pub(crate) last_seen_at: Option<DateTime<Utc>>,
+    /// The first of `job_ids`.
     pub(crate) job_id: Option<String>,
+    pub(crate) job_ids: Vec<String>,
     pub(crate) draining: bool,
 }
 
@@ -207,8 +209,20 @@ impl From<&v1::Worker> for WorkerView {
             device: worker.device.clone(),
             last_seen_at: time(worker.last_seen_at.as_ref()),
             job_id: some(&worker.job_id),
+            // A coordinator of the release before names one job alone.
+            job_ids: match &worker.job_ids[..] {
+                [] => some(&worker.job_id).into_iter().collect(),
+                several => several.to_vec(),
+            },
             draining: worker.draining,
         }
+    }
+}
+
+impl WorkerView {
+    /// Ids of what it runs.
+    pub(crate) fn jobs(&self) -> impl Iterator<Item = &str> {
+        self.job_ids.iter().map(String::as_str)
     }
 }
 

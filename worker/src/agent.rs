@@ -1,6 +1,7 @@
 //! `ign-worker agent`: runs `ign_agent` with this program's `exec` as the child.
 
 use std::io::Read;
+use std::num::NonZero;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -53,9 +54,12 @@ pub(crate) struct Options {
     /// Name of this worker [default: host name and process id].
     #[arg(long, env = "IGN_WORKER_NAME")]
     name: Option<String>,
-    /// CPU threads of a bake [default: all cores].
+    /// Jobs at once, each in a process of its own: where one does not fill the machine or its GPU.
+    #[arg(long, env = "IGN_SLOTS", value_name = "N", default_value = "1")]
+    slots: NonZero<usize>,
+    /// CPU threads of each job [default: the cores, divided between the slots].
     #[arg(long, env = "IGN_THREADS", value_name = "N")]
-    threads: Option<std::num::NonZero<usize>>,
+    threads: Option<NonZero<usize>>,
     /// Bound of the cache of captures and checkpoints.
     #[arg(
         long,
@@ -110,9 +114,10 @@ pub(crate) fn run(options: Options) -> Result<()> {
         envs: gpu.envs,
         ..ChildCommand::current_exe()?
     };
-    if let Some(threads) = options.threads {
-        config.threads = threads.get();
-    }
+    config.slots = options.slots;
+    config.threads = options
+        .threads
+        .map_or_else(|| ign_agent::threads_per_slot(options.slots), NonZero::get);
     // One thread is enough for everything but hashing, and keeps the agent small.
     tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -149,10 +154,10 @@ async fn stop_on_signal(
             _ = interrupt.recv() => {}
         }
         if shutdown.is_cancelled() {
-            output::say("stopped before the job was handed back; its lease will run out");
+            output::say("stopped before every job was handed back; their leases will run out");
             die();
         }
-        tracing::info!("stopping: the running job goes back to the queue");
+        tracing::info!("stopping: running jobs go back to the queue");
         shutdown.cancel();
     }
 }

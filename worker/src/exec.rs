@@ -189,7 +189,7 @@ fn panic_text(payload: &(dyn Any + Send)) -> String {
 
 fn crashed(message: String, at: String) -> Failure {
     let hint = if message.contains("allocate memory") || message.contains("out of memory") {
-        "out of memory: bake a smaller size, or run fewer workers on the machine"
+        "out of memory: bake a smaller size, or fewer jobs at once on the machine"
     } else {
         ""
     };

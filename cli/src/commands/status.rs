@@ -106,11 +106,7 @@ fn screen(view: &StatusView) -> String {
         shown
             .iter()
             .flat_map(|jobs| jobs.iter().map(|job| job.id.as_str()))
-            .chain(
-                view.workers
-                    .iter()
-                    .filter_map(|worker| worker.job_id.as_deref()),
-            ),
+            .chain(view.workers.iter().flat_map(WorkerView::jobs)),
     );
     let count = |state: &str| view.jobs_by_state.get(state).copied().unwrap_or(0);
     let counts: Vec<String> = STATES
@@ -194,11 +190,12 @@ fn running(jobs: &[JobView], ids: &ShortIds) -> Option<Table> {
 pub(crate) fn workers(workers: &[WorkerView], ids: &ShortIds, now: DateTime<Utc>) -> Option<Table> {
     let mut table = Table::new(&["WORKER", "HOST", ">SEEN", "JOB", "VERSION", "DEVICE"]);
     for worker in workers {
-        let doing = match (&worker.job_id, worker.draining) {
-            (Some(job), true) => format!("{} (draining)", ids.show(job)),
-            (Some(job), false) => ids.show(job),
-            (None, true) => "draining".to_string(),
-            (None, false) => "idle".to_string(),
+        let jobs: Vec<String> = worker.jobs().map(|job| ids.show(job)).collect();
+        let doing = match (jobs.join(", "), worker.draining) {
+            (jobs, true) if jobs.is_empty() => "draining".to_string(),
+            (jobs, false) if jobs.is_empty() => "idle".to_string(),
+            (jobs, true) => format!("{jobs} (draining)"),
+            (jobs, false) => jobs,
         };
         table.row([
             worker.id.clone(),
@@ -268,6 +265,7 @@ mod tests {
                 }),
                 job_id: samples::running().id,
                 draining: false,
+                job_ids: vec![samples::running().id],
             }],
             running: vec![samples::running()],
             recent_failures: vec![samples::failed()],
@@ -294,6 +292,17 @@ mod tests {
             ..Default::default()
         };
         insta::assert_snapshot!(screen(&view("http://127.0.0.1:7070/", &status)));
+    }
+
+    #[test]
+    fn every_job_of_a_worker_is_shown() {
+        let mut status = sample();
+        let worker = &mut status.workers[0];
+        worker.draining = true;
+        worker.job_ids.push(samples::failed().id);
+        let text = screen(&view("http://127.0.0.1:7070/", &status));
+        let shown = "01985a4e-0001, 01985a4e-0002 (draining)";
+        assert!(text.contains(shown), "{text}");
     }
 
     #[test]

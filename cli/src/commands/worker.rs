@@ -66,7 +66,7 @@ async fn drain(
 }
 
 fn table(views: &[WorkerView]) -> String {
-    let ids = ShortIds::of(views.iter().filter_map(|worker| worker.job_id.as_deref()));
+    let ids = ShortIds::of(views.iter().flat_map(WorkerView::jobs));
     status::workers(views, &ids, Utc::now()).map_or_else(
         || "no worker is connected\n".to_owned(),
         |table| table.to_string(),

@@ -249,14 +249,16 @@ pub(crate) fn to_log_line(line: LogLine) -> v1::LogLine {
 }
 
 pub(crate) fn to_worker(worker: &Worker) -> v1::Worker {
+    let job_ids: Vec<String> = worker.jobs.iter().map(ToString::to_string).collect();
     v1::Worker {
         id: worker.info.id.to_string(),
         hostname: worker.info.hostname.clone(),
         version: worker.info.version.clone(),
         device: worker.info.device.clone(),
         last_seen_at: Some(to_timestamp(worker.last_seen_at)),
-        job_id: worker.job.map(|job| job.to_string()).unwrap_or_default(),
+        job_id: job_ids.first().cloned().unwrap_or_default(),
         draining: worker.draining,
+        job_ids,
     }
 }
 

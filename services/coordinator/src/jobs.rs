@@ -154,11 +154,13 @@ impl App {
         readable: &BTreeSet<CollectionId>,
     ) -> Result<(), Refused> {
         for worker in workers {
-            if let Some(job) = worker.job
-                && !readable.contains(&self.store.get(job).await?.spec.object.collection)
-            {
-                worker.job = None;
+            let mut shown = Vec::new();
+            for &job in &worker.jobs {
+                if readable.contains(&self.store.get(job).await?.spec.object.collection) {
+                    shown.push(job);
+                }
             }
+            worker.jobs = shown;
         }
         Ok(())
     }

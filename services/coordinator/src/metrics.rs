@@ -149,7 +149,7 @@ impl Metrics {
             let busy = status
                 .workers
                 .iter()
-                .filter(|worker| worker.job.is_some())
+                .filter(|worker| !worker.jobs.is_empty())
                 .count();
             let workers = [
                 ("{state=\"busy\"}".to_owned(), busy as f64),

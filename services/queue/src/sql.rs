@@ -1371,14 +1371,15 @@ fn worker_from(row: &DbRow) -> Result<WorkerInfo> {
 }
 
 async fn list_workers(connection: &mut Connection, now: DateTime<Utc>) -> Result<Vec<Worker>> {
-    let rows =
-        sqlx::query("select worker, id from jobs where state = 'leased' order by started_at")
-            .fetch_all(&mut *connection)
-            .await?;
-    let mut running = BTreeMap::new();
+    let rows = sqlx::query(
+        "select worker, id from jobs where state = 'leased' order by started_at desc, id desc",
+    )
+    .fetch_all(&mut *connection)
+    .await?;
+    let mut running: BTreeMap<Option<String>, Vec<_>> = BTreeMap::new();
     for row in rows {
-        let worker: Option<String> = row.try_get("worker")?;
-        running.insert(worker, from_key(row.try_get("id")?)?);
+        let jobs = running.entry(row.try_get("worker")?).or_default();
+        jobs.push(from_key(row.try_get("id")?)?);
     }
     let rows = sqlx::query("select * from workers where last_seen_at > $1 order by id")
         .bind(to_db(now - seconds(WORKER_LISTED_SECS)))
@@ -1389,7 +1390,9 @@ async fn list_workers(connection: &mut Connection, now: DateTime<Utc>) -> Result
             let info = worker_from(row)?;
             Ok(Worker {
                 last_seen_at: time(row, "last_seen_at")?,
-                job: running.get(&Some(info.id.to_string())).copied(),
+                jobs: running
+                    .remove(&Some(info.id.to_string()))
+                    .unwrap_or_default(),
                 draining: row.try_get("draining")?,
                 info,
             })

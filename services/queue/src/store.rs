@@ -173,8 +173,8 @@ pub struct Worker {
     pub info: WorkerInfo,
     /// Its last lease call or heartbeat.
     pub last_seen_at: DateTime<Utc>,
-    /// What it runs.
-    pub job: Option<JobId>,
+    /// What it runs, the latest first: one job per busy slot.
+    pub jobs: Vec<JobId>,
     /// It gets no more jobs.
     pub draining: bool,
 }

@@ -2,8 +2,9 @@
 //!
 //! `blobs/<hex>` holds whole, verified files; `partial/<hex>` the start of files whose transfer broke off, so that
 //! it goes on where it stopped. Jobs get hard links, never the cached file itself. The cache is bounded: before a
-//! fetch the least recently used blobs go (use is kept as the file's modification time). What the running job needs
-//! is never evicted, even when it alone is larger than the bound.
+//! fetch the least recently used blobs go (use is kept as the file's modification time). What the fetching job needs
+//! is never evicted, even when it alone is larger than the bound. One job fetches at a time; the links of the others
+//! keep what they need.
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};

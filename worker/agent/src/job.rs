@@ -190,6 +190,8 @@ impl Job<'_> {
         }
         let note = |message: &str| self.note(message);
         let progress = |message: &str| self.progress("import", 0.0, message);
+        progress("waiting for another job's files");
+        let fetching = self.agent.fetching.lock().await;
         progress("fetching the capture");
         let transfer = self.transfer(&note, &progress);
         transfer
@@ -202,6 +204,7 @@ impl Job<'_> {
                 checkpoint = Some(path);
             }
         }
+        drop(fetching);
         let object = ign_events::ObjectName {
             collection: self.state.object.collection.to_string(),
             object: self.state.object.object.to_string(),
@@ -520,7 +523,7 @@ fn crash(child: &Child, stage: &str) -> Failure {
         message = format!("{message}; last output: {}", last.join(" / "));
     }
     let hint = if ending.was_killed() {
-        "the machine may have run out of memory: bake a smaller size, or run fewer workers on it"
+        "the machine may have run out of memory: bake a smaller size, or fewer jobs at once"
     } else {
         ""
     };

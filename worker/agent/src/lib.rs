@@ -1,8 +1,8 @@
 //! Worker agent: lease, heartbeat, transfer, and supervision of one child process per job.
 //!
-//! The agent asks the coordinator for one job at a time, puts the capture's files into a folder, lets a child process
-//! bake them ([`ChildCommand`], job file and events of `ign-events`), and sends checkpoints and the bundle to the
-//! store. It holds no torch state and streams every file, so its memory stays small; whatever happens to the child is
+//! Each slot of the agent asks the coordinator for one job at a time, puts the capture's files into a folder, lets a
+//! child process bake them ([`ChildCommand`], job file and events of `ign-events`), and sends checkpoints and the bundle
+//! to the store. Slots share nothing but the connection, the cache of files and the worker's name. It holds no torch state and streams every file, so its memory stays small; whatever happens to the child is
 //! a failure that the agent reports.
 //!
 //! - `control`: gRPC calls, `data_plane`: HTTP calls, one try each. `transfer`: whole transfers that go on through
@@ -27,7 +27,9 @@ mod state;
 mod transfer;
 
 use std::fs::{File, TryLockError};
+use std::num::NonZero;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use ign_proto::{Cause, WorkerId, v1};
@@ -55,6 +57,8 @@ pub struct AgentConfig {
     pub work_dir: PathBuf,
     /// Name of this worker; made from host name and process id when absent.
     pub name: Option<String>,
+    /// Jobs at once, each in a child of its own.
+    pub slots: NonZero<usize>,
     /// CPU threads for each child.
     pub threads: usize,
     /// What the bakes run on, for people: `cpu`, `NVIDIA H200`.
@@ -72,7 +76,7 @@ pub struct AgentConfig {
 }
 
 impl AgentConfig {
-    /// Usual settings: every core, 20 GB of cache, this program as child.
+    /// Usual settings: one job at a time on every core, 20 GB of cache, this program as child.
     ///
     /// # Errors
     /// The path of the running program is not known.
@@ -83,7 +87,8 @@ impl AgentConfig {
             certificates: ign_client::Files::default(),
             work_dir: work_dir.to_path_buf(),
             name: None,
-            threads: std::thread::available_parallelism().map_or(1, usize::from),
+            slots: NonZero::<usize>::MIN,
+            threads: threads_per_slot(NonZero::<usize>::MIN),
             device: "cpu".to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             cache_bytes: 20_000_000_000,
@@ -94,7 +99,13 @@ impl AgentConfig {
     }
 }
 
-/// What the parts of a running agent share.
+/// The cores of this machine, divided between `slots` jobs; at least one each.
+pub fn threads_per_slot(slots: NonZero<usize>) -> usize {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    (cores / slots).max(1)
+}
+
+/// What the slots of a running agent share.
 #[derive(Debug)]
 struct Agent {
     config: AgentConfig,
@@ -103,7 +114,11 @@ struct Agent {
     control: Control,
     data: DataPlane,
     cache: Cache,
+    /// Held while a slot fetches into the cache: no other may then evict what has come, or write to the same file.
+    fetching: tokio::sync::Mutex<()>,
     jobs_dir: PathBuf,
+    /// Whether the coordinator answered the last call for work.
+    reachable: AtomicBool,
     /// Held while the agent runs.
     _lock: File,
 }
@@ -120,51 +135,63 @@ pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<(),
     tracing::info!(
         worker = %agent.worker,
         server = %agent.config.server,
+        slots = agent.config.slots,
         threads = agent.config.threads,
         device = agent.config.device,
         "worker ready"
     );
-    let mut backoff = Backoff::default();
-    let mut reachable = true;
-    loop {
-        let answer = tokio::select! {
-            biased;
-            () = shutdown.cancelled() => break,
-            answer = agent.control.lease(agent.lease_request()) => answer,
-        };
-        let wait = match answer {
-            Ok(lease) => {
-                if !std::mem::replace(&mut reachable, true) {
-                    tracing::info!("the coordinator is back");
-                }
-                backoff.reset();
-                let Some(lease) = lease else { continue };
-                Box::pin(job::run(&agent, lease, &shutdown)).await;
-                continue;
-            }
-            Err(cause @ (Cause::Unauthenticated | Cause::Forbidden { .. })) => {
-                return Err(AgentError::Refused {
-                    message: cause.to_string(),
-                });
-            }
-            Err(cause) => {
-                if std::mem::replace(&mut reachable, false) {
-                    tracing::warn!("no work from the coordinator: {cause}; trying again");
-                }
-                let asked = cause.retry_after().unwrap_or_default();
-                backoff.next_delay().max(asked)
-            }
-        };
-        tokio::select! {
-            () = shutdown.cancelled() => break,
-            () = tokio::time::sleep(wait) => {}
-        }
-    }
+    // A slot that is refused ends the others.
+    let shutdown = shutdown.child_token();
+    let slots = (0..agent.config.slots.get()).map(|_| async {
+        let ended = agent.work(&shutdown).await;
+        shutdown.cancel();
+        ended
+    });
+    let ended = futures::future::join_all(slots).await;
     tracing::info!("worker ends");
-    Ok(())
+    ended.into_iter().collect()
 }
 
 impl Agent {
+    /// One slot: works on one job after the other until `shutdown` is cancelled.
+    async fn work(&self, shutdown: &CancellationToken) -> Result<(), AgentError> {
+        let mut backoff = Backoff::default();
+        loop {
+            let answer = tokio::select! {
+                biased;
+                () = shutdown.cancelled() => return Ok(()),
+                answer = self.control.lease(self.lease_request()) => answer,
+            };
+            let wait = match answer {
+                Ok(lease) => {
+                    if !self.reachable.swap(true, Ordering::Relaxed) {
+                        tracing::info!("the coordinator is back");
+                    }
+                    backoff.reset();
+                    let Some(lease) = lease else { continue };
+                    Box::pin(job::run(self, lease, shutdown)).await;
+                    continue;
+                }
+                Err(cause @ (Cause::Unauthenticated | Cause::Forbidden { .. })) => {
+                    return Err(AgentError::Refused {
+                        message: cause.to_string(),
+                    });
+                }
+                Err(cause) => {
+                    if self.reachable.swap(false, Ordering::Relaxed) {
+                        tracing::warn!("no work from the coordinator: {cause}; trying again");
+                    }
+                    let asked = cause.retry_after().unwrap_or_default();
+                    backoff.next_delay().max(asked)
+                }
+            };
+            tokio::select! {
+                () = shutdown.cancelled() => return Ok(()),
+                () = tokio::time::sleep(wait) => {}
+            }
+        }
+    }
+
     fn prepare(config: AgentConfig) -> Result<Self, AgentError> {
         let unusable = |reason: &str| AgentError::Server {
             url: config.server.clone(),
@@ -216,7 +243,9 @@ impl Agent {
             control: Control::new(&server, &config.token, &tls)?,
             data: DataPlane::new(&server, &config.token, &tls)?,
             cache,
+            fetching: tokio::sync::Mutex::default(),
             jobs_dir,
+            reachable: AtomicBool::new(true),
             worker,
             hostname,
             _lock: lock,

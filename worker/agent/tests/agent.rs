@@ -374,6 +374,100 @@ async fn a_drained_worker_finishes_its_job_and_waits_for_the_end_of_the_drain() 
     worker.stop().await;
 }
 
+#[tokio::test]
+async fn slots_run_side_by_side_and_each_job_ends_by_itself() {
+    let coordinator = Coordinator::start().await;
+    let capture = coordinator.add_capture(SMALL);
+    let endless = json!([{"checkpoint": "c"}, {"print": "at work"}, {"sleep_ms": 600_000}]);
+    let cancelled = coordinator.queue(&capture, &endless);
+    let stopped = coordinator.queue(&capture, &endless);
+    let next = coordinator.queue(&capture, &json!([{"read": "images/1.png"}, {"done": 5}]));
+    let worker = Worker::with_slots(&coordinator.url, 2);
+    coordinator
+        .until("two at work", |world| {
+            let at_work = world.logs.iter().filter(|line| *line == "at work");
+            at_work.count() == 2 && world.checkpoints.len() == 2
+        })
+        .await;
+    let pids = coordinator.world().logs_after("pid ");
+    assert!(
+        pids.len() == 2 && pids.iter().all(|pid| alive(pid)),
+        "{pids:?}"
+    );
+    let folders = std::fs::read_dir(worker.dir.path().join("jobs")).unwrap();
+    assert_eq!(folders.count(), 2);
+    assert_eq!(coordinator.world().queue.len(), 1);
+
+    // One slot becomes free; the job of the other goes on.
+    coordinator.world().cancel.insert(cancelled.clone());
+    let failure = failed(coordinator.end_of(&cancelled).await);
+    assert_eq!(failure.kind(), FailureKind::Cancelled);
+    completed(coordinator.end_of(&next).await);
+    assert_eq!(pids.iter().filter(|pid| alive(pid)).count(), 1);
+    let fetched = coordinator
+        .world()
+        .requests
+        .iter()
+        .filter(|line| line.starts_with("GET ") && line.contains("/blobs/"))
+        .count();
+    assert_eq!(
+        fetched,
+        SMALL.len(),
+        "what one slot fetched serves the others"
+    );
+
+    worker.stop().await;
+    assert!(!pids.iter().any(|pid| alive(pid)));
+    let failure = failed(coordinator.end_of(&stopped).await);
+    assert_eq!(failure.message, "worker shut down");
+}
+
+#[tokio::test]
+async fn a_drain_lets_every_slot_finish() {
+    let coordinator = Coordinator::start().await;
+    let capture = coordinator.add_capture(SMALL);
+    let script = json!([{"sleep_ms": 800}, {"done": 5}]);
+    let running = [
+        coordinator.queue(&capture, &script),
+        coordinator.queue(&capture, &script),
+    ];
+    let waiting = coordinator.queue(&capture, &json!([{"done": 5}]));
+    let worker = Worker::with_slots(&coordinator.url, 2);
+    coordinator
+        .until("the leases", |world| world.queue.len() == 1)
+        .await;
+    coordinator.world().drain = true;
+    for job in &running {
+        completed(coordinator.end_of(job).await);
+    }
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    assert_eq!(coordinator.world().queue.len(), 1);
+    coordinator.world().drain = false;
+    completed(coordinator.end_of(&waiting).await);
+    worker.stop().await;
+}
+
+#[tokio::test]
+async fn a_refused_slot_ends_the_agent_and_hands_the_other_job_back() {
+    let coordinator = Coordinator::start().await;
+    let capture = coordinator.add_capture(SMALL);
+    let job = coordinator.queue(&capture, &json!([{"sleep_ms": 600_000}]));
+    let worker = Worker::with_slots(&coordinator.url, 2);
+    coordinator
+        .until("start", |world| world.log_after("pid ").is_some())
+        .await;
+    let pid = coordinator.world().log_after("pid ").unwrap();
+    coordinator.world().refuse_leases = true;
+    let ended = worker.task.await.unwrap();
+    assert!(
+        matches!(ended, Err(AgentError::Refused { .. })),
+        "{ended:?}"
+    );
+    let failure = failed(coordinator.end_of(&job).await);
+    assert_eq!(failure.message, "worker shut down");
+    assert!(!alive(&pid));
+}
+
 /// Also where nothing is exported.
 #[tokio::test]
 async fn the_trace_of_the_lease_reaches_the_child_and_comes_back_with_calls() {

@@ -320,3 +320,44 @@ async fn another_worker_goes_on_where_one_was_shut_down() {
     );
     second.stop().await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_slots_bake_two_jobs_at_once_and_status_shows_both() {
+    let service = Service::start().await;
+    let capture = service.upload(FILES).await;
+    let mut running = Vec::new();
+    for name in ["one", "two"] {
+        let script = json!([{"print": name}, {"sleep_ms": 3000}, {"done": 100}]);
+        running.push(service.submit(&capture, script).await);
+    }
+    let queued = service.submit(&capture, json!([{"done": 100}])).await;
+    let worker = Worker::with_slots(&service.url(), 2);
+    for job in &running {
+        service
+            .until(job, "start", |job| job.state() == v1::JobState::Leased)
+            .await;
+    }
+    let request = Service::request(v1::StatusRequest::default());
+    let status = service.jobs().await.status(request).await.unwrap();
+    let status = status.into_inner();
+    assert_eq!(status.workers.len(), 1);
+    let shown = &status.workers[0];
+    assert_eq!(shown.id, "tester");
+    assert_eq!(shown.job_id, shown.job_ids[0]);
+    let mut ids = shown.job_ids.clone();
+    ids.sort_unstable();
+    running.sort_unstable();
+    assert_eq!(ids, running);
+    assert_eq!(status.running.len(), 2);
+
+    let mut versions = Vec::new();
+    for job in running.iter().chain([&queued]) {
+        let end = service.ended(job).await;
+        assert_eq!(end.state(), v1::JobState::Succeeded, "{end:?}");
+        assert_eq!(end.attempt, 1);
+        versions.push(end.bundle.unwrap().version);
+    }
+    versions.sort_unstable();
+    assert_eq!(versions, [1, 2, 3]);
+    worker.stop().await;
+}

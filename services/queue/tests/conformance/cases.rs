@@ -901,11 +901,14 @@ pub(crate) async fn drained_workers_get_nothing(bench: &Bench) {
     let listed = bench.store.workers().await.unwrap();
     assert_eq!(listed.len(), 1);
     assert_eq!(
-        (&listed[0].info, listed[0].job, listed[0].draining),
-        (&worker("w"), Some(job.id), true)
+        (&listed[0].info, &listed[0].jobs[..], listed[0].draining),
+        (&worker("w"), &[job.id][..], true)
     );
     bench.store.drain_worker(&id, false).await.unwrap();
-    assert!(bench.lease("w").await.is_some());
+    let second = bench.lease("w").await.unwrap();
+    let listed = bench.store.workers().await.unwrap();
+    assert_eq!(listed.len(), 1);
+    assert_eq!(listed[0].jobs, [second.id, job.id], "the latest first");
     assert_eq!(
         kind(
             &bench
@@ -1260,9 +1263,9 @@ pub(crate) async fn status_shows_one_screen(bench: &Bench) {
     let workers: Vec<_> = status
         .workers
         .iter()
-        .map(|w| (w.info.id.as_str(), w.job))
+        .map(|w| (w.info.id.as_str(), &w.jobs[..]))
         .collect();
-    assert_eq!(workers, [("idle", None), ("w", Some(running.id))]);
+    assert_eq!(workers, [("idle", &[][..]), ("w", &[running.id][..])]);
     assert!((status.at - running.started_at.unwrap()).num_seconds() < 60);
 
     let library = bench

@@ -43,6 +43,8 @@ pub(crate) struct World {
     pub(crate) cancel: HashSet<String>,
     pub(crate) lost: HashSet<String>,
     pub(crate) drain: bool,
+    /// Calls for work are forbidden.
+    pub(crate) refuse_leases: bool,
     /// What heartbeats say that they belong to.
     pub(crate) traces: std::collections::BTreeSet<String>,
     /// Nothing is served.
@@ -356,6 +358,10 @@ impl Workers for Coordinator {
         loop {
             let lease = {
                 let mut world = self.world();
+                if world.refuse_leases {
+                    let message = "no more".to_owned();
+                    return Err(Cause::Forbidden { message }.status());
+                }
                 if world.drain {
                     None
                 } else {
@@ -455,9 +461,15 @@ impl Workers for Coordinator {
 impl World {
     /// The rest of the first log line that begins so.
     pub(crate) fn log_after(&self, start: &str) -> Option<String> {
+        self.logs_after(start).into_iter().next()
+    }
+
+    /// The rest of every log line that begins so.
+    pub(crate) fn logs_after(&self, start: &str) -> Vec<String> {
         self.logs
             .iter()
-            .find_map(|line| line.strip_prefix(start))
+            .filter_map(|line| line.strip_prefix(start))
             .map(str::to_owned)
+            .collect()
     }
 }

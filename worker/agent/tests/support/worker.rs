@@ -2,6 +2,7 @@
 
 #![expect(clippy::unwrap_used, reason = "a panic is how a test fails")]
 
+use std::num::NonZero;
 use std::time::Duration;
 
 use ign_agent::{AgentConfig, AgentError, ChildCommand};
@@ -33,9 +34,17 @@ pub(crate) fn config(url: &str, dir: &std::path::Path) -> AgentConfig {
 
 impl Worker {
     pub(crate) fn start(url: &str) -> Self {
+        Self::with_slots(url, 1)
+    }
+
+    pub(crate) fn with_slots(url: &str, slots: usize) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let shutdown = CancellationToken::new();
-        let task = tokio::spawn(ign_agent::run(config(url, dir.path()), shutdown.clone()));
+        let config = AgentConfig {
+            slots: NonZero::new(slots).unwrap(),
+            ..config(url, dir.path())
+        };
+        let task = tokio::spawn(ign_agent::run(config, shutdown.clone()));
         Self {
             dir,
             shutdown,
