@@ -21,11 +21,14 @@ class Case:
     peer: str
     unit: str
     views: int
-    limit_bytes: Callable[[dict], float]
-    """Bytes that have to move per item, from our side's result; over the measured bandwidth: the machine's limit."""
-    limit_means: str
+    limit_bytes: Callable[[dict], float] | None = None
+    """Bytes that have to move per item, from our side's result; over the measured bandwidth: the machine's limit. None
+    where the limit is another one."""
+    limit_means: str = ""
     peer_runs: int | None = None
     """At most this many runs of the peer, where it is slow."""
+    requirements: str = "requirements.txt"
+    """What the peer imports."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,31 @@ def mesh_bytes(result):
 def map_bytes(result, per_pixel):
     return per_pixel * result["pixels"] / result["items"]
 
+
+def network(name, net, does, steps, frames):
+    """The two cases of a network: training steps and frames, beside the same thing in eager PyTorch."""
+    for work, unit, count, what in [("train", "step", steps, "training steps"), ("render", "frame", frames, "frames of 256 px")]:
+        yield Case(
+            name=f"{name}_{work}", does=f"{what}: {does[work]}",
+            package="ign-nets", bench="networks", arguments=("--net", net, "--work", work),
+            peer="torch_networks.py", unit=unit, views=count, requirements="requirements-torch.txt",
+        )
+
+
+NETWORKS = [
+    *network("paper_effects", "paper_effects", {
+        "train": "the paper's EffectsNet on a pair of 128 px", "render": "the paper's EffectsNet",
+    }, 20, 20),
+    *network("paper_composition", "paper_composition", {
+        "train": "the paper's CompositionNet against its discriminator, 128 px", "render": "the paper's CompositionNet",
+    }, 10, 10),
+    *network("point_effects", "point_effects", {
+        "train": "EffectsNet of preset standard, 8192 pairs", "render": "EffectsNet of preset standard, a point a pixel",
+    }, 60, 20),
+    *network("blend", "blend", {
+        "train": "CompositionNet of preset standard, 4 windows of 64 px", "render": "CompositionNet of preset standard",
+    }, 20, 20),
+]
 
 CASES = [
     Case(
@@ -89,6 +117,7 @@ CASES = [
         limit_bytes=lambda r: r["photograph_bytes"] + r["output_bytes"],
         limit_means="the file read once, the picture written once",
     ),
+    *NETWORKS,
 ]
 
 SERVICES = [

@@ -28,9 +28,9 @@ def say(text):
     print(f"bench: {text}", file=sys.stderr, flush=True)
 
 
-def environment():
-    """The Python of the environment that holds the pinned peers."""
-    requirements = os.path.join(HERE, "requirements.txt")
+def environment(requirements):
+    """The Python of the environment that holds the peers pinned in a file."""
+    requirements = os.path.join(HERE, requirements)
     with open(requirements, "rb") as file:
         digest = hashlib.sha256(file.read() + sys.version.encode()).hexdigest()[:12]
     cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
@@ -135,7 +135,8 @@ def agree(ours, theirs):
     return ours == theirs
 
 
-def measure(case, program, python, options, bandwidths):
+def measure(case, program, options, bandwidths):
+    python = environment(case.requirements)
     views = options.views or case.views
     ours = [program, *case.arguments, "--views", str(views)]
     with tempfile.TemporaryDirectory() as data:
@@ -160,11 +161,10 @@ def measure(case, program, python, options, bandwidths):
     def median(side, threads, key="secs"):
         return statistics.median(result[key] for result in runs[side, threads])
 
-    limit_bytes = case.limit_bytes(first)
+    limit_bytes = case.limit_bytes(first) if case.limit_bytes else None
     rows = []
     for threads in options.threads:
         secs, peer_secs = median("ours", threads), median("peer", threads)
-        limit_secs = limit_bytes * first["items"] / bandwidths[threads]
         rows.append({
             "threads": threads,
             "secs": secs,
@@ -174,13 +174,13 @@ def measure(case, program, python, options, bandwidths):
             "peer_prepare_secs": median("peer", threads, "prepare_secs"),
             "times_the_peer": peer_secs / secs,
             "scaling": median("ours", options.threads[0]) / secs,
-            "share_of_limit": limit_secs / secs,
+            "share_of_limit": limit_bytes and limit_bytes * first["items"] / bandwidths[threads] / secs,
             "peak_bytes": median("ours", threads, "peak_bytes"),
             "peer_peak_bytes": median("peer", threads, "peak_bytes"),
         })
     return {
         "name": case.name, "does": case.does, "unit": case.unit, "views": views, "rows": rows,
-        "limit": f"{limit_bytes / 1e6:.2f} MB a {case.unit}: {case.limit_means}",
+        "limit": limit_bytes and f"{limit_bytes / 1e6:.2f} MB a {case.unit}: {case.limit_means}",
         "peak_bytes_by_views": {str(half): fewer["peak_bytes"], str(views): rows[-1]["peak_bytes"]},
         "runs": [{"side": side, "threads": threads, **run} for (side, threads), all in runs.items() for run in all],
     }
@@ -194,7 +194,7 @@ def table(result):
         [
             str(row["threads"]), f"{row['secs']:.3g} s", f"{row['per_second']:.3g}", f"{row['prepare_secs']:.2g} s",
             f"{row['peer_secs']:.3g} s", f"{row['peer_prepare_secs']:.2g} s", f"{row['times_the_peer']:.2f}x",
-            f"{row['scaling']:.2f}x", f"{row['share_of_limit']:.1%}", f"{row['peak_bytes'] / 1e6:.0f} MB",
+            f"{row['scaling']:.2f}x", f"{row['share_of_limit']:.1%}" if result["limit"] else "-", f"{row['peak_bytes'] / 1e6:.0f} MB",
             f"{row['peer_peak_bytes'] / 1e6:.0f} MB",
         ]
         for row in result["rows"]
@@ -203,7 +203,8 @@ def table(result):
     for row in [heads, *cells]:
         lines.append("  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths)))
     peaks = ", ".join(f"{peak / 1e6:.0f} MB for {views} {unit}s" for views, peak in result["peak_bytes_by_views"].items())
-    lines.append(f"  limit: {result['limit']}; memory: {peaks}")
+    limit = f"limit: {result['limit']}; " if result["limit"] else ""
+    lines.append(f"  {limit}memory: {peaks}")
     return "\n".join(lines)
 
 
@@ -222,11 +223,12 @@ def main():
         parser.error(f"no case {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     cases = [case for case in CASES if not options.names or case.name in options.names]
     services = [case for case in SERVICES if not options.names or case.name in options.names]
-    python = environment() if cases else None
     programs = build([*cases, *services])
     started, load = time.monotonic(), os.getloadavg()
-    bandwidths = {threads: bandwidth(python, threads) for threads in options.threads if cases}
-    results = [measure(case, programs[case.package, case.bench], python, options, bandwidths) for case in cases]
+    limited = [case for case in cases if case.limit_bytes]
+    python = environment(limited[0].requirements) if limited else None
+    bandwidths = {threads: bandwidth(python, threads) for threads in options.threads if limited}
+    results = [measure(case, programs[case.package, case.bench], options, bandwidths) for case in cases]
     figures = [
         measure_service(case, programs[case.package, case.bench], ["--rounds", str(options.rounds), *options.service.split()])
         for case in services

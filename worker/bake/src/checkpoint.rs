@@ -294,10 +294,12 @@ impl<'a> Session<'a> {
         let before = current.elapsed_secs;
         let mut elapsed = before;
         let mut paused = 0.0;
+        let activity = self.reporter.activity("steps");
         loop {
             let progress = schedule.progress(current.step, elapsed);
             if schedule.is_due(&current.course, current.step, progress) {
                 let pause = Instant::now();
+                self.reporter.activity("watching");
                 let averaged = trainees[0].adam.averaged(&trainees[0].params);
                 let watch = stage.watch.as_ref();
                 let error = watch.and_then(|watch| (watch.validation)(&averaged));
@@ -306,6 +308,7 @@ impl<'a> Session<'a> {
                 }
                 schedule.observed(&mut current.course, current.step, progress, error);
                 good = (current.clone(), Snapshot::of(&trainees, best.as_ref()));
+                self.reporter.activity("steps");
                 paused += pause.elapsed().as_secs_f64();
             }
             let end = schedule.end(&current.course);
@@ -350,10 +353,13 @@ impl<'a> Session<'a> {
             );
             if self.last_saved.elapsed().as_secs_f64() >= self.interval_secs {
                 let pause = Instant::now();
+                self.reporter.activity("saving");
                 self.save(Some((&current, &Snapshot::of(&trainees, best.as_ref()))))?;
+                self.reporter.activity("steps");
                 paused += pause.elapsed().as_secs_f64();
             }
         }
+        self.reporter.activity(activity);
         self.meta.secs.insert(name.into(), elapsed);
         self.meta.steps.insert(name.into(), current.step);
         if current.course.ended_early() {
@@ -724,7 +730,8 @@ mod tests {
     /// Steps move the weights past Adam, whose average follows by itself: one step of it with no gradient.
     fn step(trainees: &mut [Trainee], rate: f64) -> f64 {
         let loss = descend(&trainees[0], rate);
-        assert!(trainees[0].step(0.0, 1.0));
+        let Trainee { params, adam } = &mut trainees[0];
+        assert!(adam.step(params, &params.flat().zeros_like(), 0.0, 1.0));
         loss
     }
 

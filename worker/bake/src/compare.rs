@@ -201,11 +201,16 @@ pub(crate) fn rows(
     let with = |name: &str, model: &Model, secs, views| {
         score(name, secs, names, views, |target| model.image(target))
     };
-    rows.push(with("ours", model, ours.secs, held_out));
+    let scored = with("ours", model, ours.secs, held_out);
+    rows.push(scored.clone());
     for (method, rival) in &rivals.0 {
         let name = method.name();
         rows.push(match rival {
-            Rival::Ours => with(name, model, ours.secs, held_out),
+            Rival::Ours => {
+                let mut same = scored.clone();
+                name.clone_into(&mut same.metrics.name);
+                same
+            }
             Rival::Model(trained, drawn) => {
                 let views = drawn.as_ref().map_or(held_out, |drawn| &drawn.held_out);
                 with(name, &trained.model, trained.secs, views)

@@ -1,7 +1,7 @@
 //! Training of `CompositionNet` (Sec. "Image compositing").
 //!
 //! What a training view shows the network does not change while it trains: warps, effects and coverage are computed
-//! once per view and kept in half precision, cut to the object's bounds.
+//! once per view and kept in half precision, cut to the object's bounds ([`ViewStore`]).
 //!
 //! Deviation (presets `standard` and `auto`): a training view that is a reference is blended from the other references, as
 //! if its own picture were not there. Otherwise two training views in five of a small capture are shown with the answer
@@ -17,7 +17,7 @@ use ign_nets::composition::{BlendComposition, BlendInput, PaperComposition};
 use ign_nets::losses;
 use ign_nets::optim::Trainee;
 use ign_nets::patchgan::PatchGan;
-use ign_nets::steps::{Gan, GanExample, RATE};
+use ign_nets::steps::{Descent, Gan, GanExample, RATE, blend_step};
 use ign_nets::{Builder, Params};
 use ign_render::{Model, ReferenceImage, RenderSettings, Target};
 use rand::RngExt;
@@ -31,6 +31,7 @@ use crate::recipe::{Loss, Settings};
 use crate::sampler::step_rng;
 use crate::schedule::Schedule;
 use crate::training::Drawn;
+use crate::views::ViewStore;
 
 /// Peak learning rate of the blending head.
 const BLEND_RATE: f64 = 1.5e-3;
@@ -48,16 +49,6 @@ fn with_kind(input: &BlendInput, kind: Kind) -> BlendInput {
         visibility: input.visibility.to_kind(kind),
         target: input.target.to_kind(kind),
     }
-}
-
-/// One training view: input, truth and factors, cut to the object's bounds.
-struct Example {
-    input: BlendInput,
-    /// [1, 3, h, w] f16.
-    truth: Tensor,
-    /// [1, 1, h, w] f16: coverage times scored.
-    coverage: Tensor,
-    size: (i64, i64),
 }
 
 /// Prepares views for measuring with what `input` makes of them.
@@ -108,15 +99,16 @@ fn mean_errors<I>(views: &[Watched<'_, I>], image: impl Fn(&I) -> Tensor) -> Opt
     (!views.is_empty()).then_some((sums.0 / count, sums.1 / count))
 }
 
+/// Every training view that shows the object, cut to its bounds: input, truth, coverage times scored.
 fn examples(
     data: &Dataset<'_>,
     session: &Session<'_>,
     model: &Model,
     settings: &Settings,
     references: &[ReferenceImage],
-) -> Result<Vec<Example>, BakeError> {
+) -> Result<ViewStore, BakeError> {
     let patch = settings.patch;
-    let mut examples = Vec::with_capacity(data.train.len());
+    let mut examples = data.view_store();
     each_training_view(data, session, &model.settings, |view, scored| {
         let name = &data.scene.views[view].name;
         let own = references.iter().position(|image| &image.name == name);
@@ -124,17 +116,17 @@ fn examples(
         let input = model.blend_input_without(&scored.target, hidden);
         let coverage = &scored.target.coverage * &scored.counted;
         let Some((y, x, h, w)) = bounds(&coverage, patch) else {
-            return;
+            return Ok(());
         };
-        let cut = |t: &Tensor| t.narrow(2, y, h).narrow(3, x, w).to_kind(Kind::Half);
-        examples.push(Example {
-            input: with_kind(&input.crop(y, x, h, w), Kind::Half),
-            truth: cut(&scored.canonical_truth()),
-            coverage: cut(&coverage),
-            size: (h, w),
-        });
+        let cut = |t: &Tensor| t.narrow(2, y, h).narrow(3, x, w);
+        examples.push(&[
+            input.crop(y, x, h, w).planes(),
+            cut(&scored.canonical_truth()),
+            cut(&coverage),
+        ])
     })?;
-    if examples.is_empty() {
+    say_where(session, &examples);
+    if examples.len() == 0 {
         return Err(BakeError::Unusable {
             message: "no training view shows the object".into(),
             hint: "check that proxy and cameras are in the same frame".into(),
@@ -148,16 +140,27 @@ fn each_training_view(
     data: &Dataset<'_>,
     session: &Session<'_>,
     settings: &RenderSettings,
-    mut work: impl FnMut(usize, &Scored),
+    mut work: impl FnMut(usize, &Scored) -> Result<(), BakeError>,
 ) -> Result<(), BakeError> {
+    let before = session.reporter.activity("warps");
     for (at, &view) in data.train.iter().enumerate() {
         session.reporter.step(
             0.0,
             &format!("warping training view {} of {}", at + 1, data.train.len()),
         );
-        work(view, &data.scored(view, settings)?);
+        work(view, &data.scored(view, settings)?)?;
     }
+    session.reporter.activity(before);
     Ok(())
+}
+
+fn say_where(session: &Session<'_>, examples: &ViewStore) {
+    if examples.on_disk_bytes() > 0 {
+        session.reporter.info(format!(
+            "{} MB of training views do not fit into cache_mb and lie on disk",
+            examples.on_disk_bytes() >> 20
+        ));
+    }
 }
 
 /// Rows and columns that hold the object, grown to at least `patch` where the image allows: (y, x, height, width).
@@ -239,48 +242,42 @@ pub(crate) fn train_blend(
     session.train(&stage, vec![trainee], |trainees, step, rate| {
         let trainee = &mut trainees[0];
         let mut rng = step_rng(plan.seed, plan.stage, step);
-        let mut inputs = Vec::with_capacity(batch);
-        let (mut truths, mut coverages) = (Vec::new(), Vec::new());
-        // Windows of a batch have one size: the smallest that all its views can give.
-        let picked: Vec<&Example> = (0..batch)
-            .map(|_| &examples[rng.random_range(0..examples.len())])
+        let picked: Vec<usize> = (0..batch)
+            .map(|_| rng.random_range(0..examples.len()))
             .collect();
-        let h = picked
-            .iter()
-            .map(|e| e.size.0)
-            .min()
-            .unwrap_or(1)
-            .min(patch);
-        let w = picked
-            .iter()
-            .map(|e| e.size.1)
-            .min()
-            .unwrap_or(1)
-            .min(patch);
-        for example in picked {
-            let y = rng.random_range(0..=example.size.0 - h);
-            let x = rng.random_range(0..=example.size.1 - w);
-            let mut input = with_kind(&example.input.crop(y, x, h, w), Kind::Float);
-            if settings.shuffle {
-                let mut order: Vec<i64> = (0..drawn.settings.k as i64).collect();
-                order.shuffle(&mut rng);
-                input = input.reordered(&order);
-            }
-            inputs.push(input);
-            truths.push(example.truth.narrow(2, y, h).narrow(3, x, w));
-            coverages.push(example.coverage.narrow(2, y, h).narrow(3, x, w));
+        // Windows of a batch have one size: the smallest that all its views can give.
+        let (h, w) = picked.iter().fold((patch, patch), |(h, w), &view| {
+            let size = examples.size(view);
+            (h.min(size.0), w.min(size.1))
+        });
+        let from: Vec<(usize, i64, i64)> = picked
+            .into_iter()
+            .map(|view| {
+                let size = examples.size(view);
+                let y = rng.random_range(0..=size.0 - h);
+                (view, y, rng.random_range(0..=size.1 - w))
+            })
+            .collect();
+        let windows = examples.windows(&from, (h, w));
+        let channels = windows.size()[1];
+        let k = drawn.settings.k;
+        let mut input = BlendInput::of_planes(&windows.narrow(1, 0, channels - 4), k);
+        if settings.shuffle {
+            let mut order: Vec<i64> = (0..k as i64).collect();
+            order.shuffle(&mut rng);
+            input = input.reordered(&order);
         }
-        let truth = Tensor::cat(&truths, 0).to_kind(Kind::Float);
-        let coverage = Tensor::cat(&coverages, 0).to_kind(Kind::Float);
-        let params = trainee.params.in_kind(settings.kind());
-        let image = net.forward(&params, &BlendInput::batch(&inputs)) * &coverage;
+        let truth = windows.narrow(1, channels - 4, 3);
+        let coverage = windows.narrow(1, channels - 1, 1);
         let loss = match settings.loss {
-            Loss::Mixed => losses::blend(&image, &truth, &coverage),
-            Loss::L1 => losses::l1(&image, &truth),
+            Loss::Mixed => losses::blend,
+            Loss::L1 => |image: &Tensor, truth: &Tensor, _: &Tensor| losses::l1(image, truth),
         };
-        loss.backward();
-        trainee.step(BLEND_RATE * rate, 1.0);
-        loss.double_value(&[])
+        let descent = Descent {
+            rate: BLEND_RATE * rate,
+            kind: settings.kind(),
+        };
+        blend_step(&net, trainee, &input, (&truth, &coverage), loss, descent)
     })
 }
 
@@ -305,14 +302,15 @@ pub(crate) fn train_generator(
     views: Views<'_>,
 ) -> Result<(), BakeError> {
     let half = |target: &Target| (input.of)(target).to_kind(Kind::Half);
-    let mut examples = Vec::with_capacity(data.train.len());
+    let mut examples = data.view_store();
     each_training_view(data, session, input.settings, |_, scored| {
-        examples.push((
-            half(&scored.target),
-            scored.canonical_truth().to_kind(Kind::Half),
-            (&scored.target.coverage * &scored.counted).to_kind(Kind::Half),
-        ));
+        examples.push(&[
+            (input.of)(&scored.target),
+            scored.canonical_truth(),
+            &scored.target.coverage * &scored.counted,
+        ])
     })?;
+    say_where(session, &examples);
     let mut builder = Builder::new();
     let generator = PaperComposition::new(&mut builder, input.channels);
     let painter = Trainee::new(builder.build(data.device, plan.seed), 0.0);
@@ -347,11 +345,12 @@ pub(crate) fn train_generator(
     trainees.extend(input.adversarial.then_some(critic));
     session.train(&stage, trainees, |trainees, step, rate| {
         let mut rng = step_rng(plan.seed, plan.stage, step);
-        let (input, truth, coverage) = &examples[rng.random_range(0..examples.len())];
+        let view = rng.random_range(0..examples.len());
+        let image = examples.windows(&[(view, 0, 0)], examples.size(view));
         let example = GanExample {
-            input: &input.to_kind(Kind::Float),
-            truth: &truth.to_kind(Kind::Float),
-            coverage: &coverage.to_kind(Kind::Float),
+            input: &image.narrow(1, 0, input.channels),
+            truth: &image.narrow(1, input.channels, 3),
+            coverage: &image.narrow(1, input.channels + 3, 1),
         };
         match trainees {
             [painter, critic] => gan.step(painter, critic, &example, RATE * rate),

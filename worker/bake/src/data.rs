@@ -12,6 +12,8 @@
 //! exposure: photographs are multiplied by their view's gain, in linear light. Scores compare with the photographs as
 //! they are, so a rendering is divided by the view's gain first ([`Scored::photographed`]), every method's alike.
 
+use std::path::{Path, PathBuf};
+
 use ign_capture::{Background, Frame, Gains, ImportError, Scene, ViewImage};
 use ign_geometry::select::Candidates;
 use ign_geometry::silhouette::{self, Outline};
@@ -24,6 +26,7 @@ use tch::{Device, Kind, Tensor};
 
 use crate::BakeError;
 use crate::recipe::{Crop, Recipe, Settings};
+use crate::views::ViewStore;
 
 /// Of the training views, one in so many validates: it is neither trained on nor a reference.
 const VALIDATION_EVERY: usize = 10;
@@ -56,6 +59,9 @@ pub(crate) struct Dataset<'a> {
     /// Per view of the scene and channel, linear light: from the photograph to the canonical exposure.
     pub(crate) gains: Vec<[f32; 3]>,
     pub(crate) device: Device,
+    /// Memory for what training views show, and the folder for what does not fit.
+    cache_bytes: u64,
+    work_dir: PathBuf,
 }
 
 /// One view as it is scored.
@@ -116,6 +122,7 @@ impl<'a> Dataset<'a> {
         recipe: &Recipe,
         settings: &Settings,
         device: Device,
+        work_dir: &Path,
     ) -> Result<Self, BakeError> {
         let normalisation = scene.mesh.normalisation();
         let frame = match recipe.crop {
@@ -178,7 +185,14 @@ impl<'a> Dataset<'a> {
                 .map(|gain| gain.map(|channel| channel as f32))
                 .collect(),
             device,
+            cache_bytes: settings.cache_mb << 20,
+            work_dir: work_dir.to_owned(),
         })
+    }
+
+    /// For what training views show one network.
+    pub(crate) fn view_store(&self) -> ViewStore {
+        ViewStore::new(&self.work_dir, self.cache_bytes, self.device)
     }
 
     /// Brings the proxy's outline to the masks of the training views where that helps views that had no part in it, if
@@ -501,6 +515,7 @@ mod tests {
                 &recipe,
                 &settings,
                 Device::Cpu,
+                folder.path(),
             )
             .expect("a dataset");
             let view = data.train[0];

@@ -1,15 +1,13 @@
 //! Training of `EffectsNet` (Sec. "Self-supervised Training").
 //!
-//! Both forms minimise the difference of two views' diffuse colours at the same surface point. [`train_points`]
-//! states it as a prediction: what the other view saw, minus its effects, plus this view's effects, is what this view
-//! saw; compared in encoded sRGB, the values that are scored. Where the other view's colour is clipped, what it hides
-//! is unknown and the pair does not count.
+//! Both forms minimise the difference of two views' diffuse colours at the same surface point (`ign_nets::steps`); here is
+//! what they learn from.
 
 use ign_nets::effects::{PaperEffects, PointEffects};
-use ign_nets::losses::{self, Pair};
+use ign_nets::losses;
 use ign_nets::optim::Trainee;
-use ign_nets::steps::{self, SPARSITY, SiamesePair};
-use ign_nets::warp::{Sources, directions};
+use ign_nets::steps::{self, Descent, Observations, PointPairs, SiamesePair};
+use ign_nets::warp::Sources;
 use ign_nets::{Builder, Params};
 use ign_render::{RenderSettings, Target};
 use rand::RngExt;
@@ -46,27 +44,8 @@ pub(crate) struct Plan {
     pub(crate) kind: Kind,
 }
 
-/// Every surface point that a training or validation view sees, with its colour; the training views come first.
-struct Observations {
-    /// Number of points that training views see.
-    trained_points: i64,
-    /// Number of training views.
-    trained_views: i64,
-    /// [N, 3].
-    points: Tensor,
-    /// [N, 3].
-    normals: Tensor,
-    /// [N, 3] encoded sRGB.
-    colors: Tensor,
-    /// [N] i64.
-    views: Tensor,
-    sources: Sources,
-    /// [V*H*W, 3] u8 and [V*H*W] u8.
-    source_colors: Tensor,
-    source_alpha: Tensor,
-}
-
-fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
+/// Every surface point that a training or validation view sees, those of the training views first, and how many these are.
+fn observe_all(data: &Dataset<'_>) -> Result<(Observations, i64), BakeError> {
     struct One {
         camera: ign_geometry::Camera,
         points: Vec<f32>,
@@ -182,9 +161,8 @@ fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
         })
         .collect();
     let trained = &views[..data.train.len()];
-    Ok(Observations {
-        trained_points: trained.iter().map(|v| v.points.len() as i64 / 3).sum(),
-        trained_views: data.train.len() as i64,
+    let trained_points = trained.iter().map(|v| v.points.len() as i64 / 3).sum();
+    let observations = Observations {
         points: stack(|v| &v.points),
         normals: stack(|v| &v.normals),
         colors: stack(|v| &v.colors),
@@ -192,7 +170,8 @@ fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
         sources: Sources::new(&cameras, &depth, data.device),
         source_colors: Tensor::cat(&rgb, 0).to_device(data.device),
         source_alpha: Tensor::cat(&alpha, 0).to_device(data.device),
-    })
+    };
+    Ok((observations, trained_points))
 }
 
 /// Copies a row-major image of `channels` into the top-left corner of one of size `to`.
@@ -215,11 +194,14 @@ pub(crate) fn train_points(
     plan: &Plan,
 ) -> Result<(), BakeError> {
     let (seed, batch) = (plan.seed, plan.batch);
-    let observations = observe_all(data)?;
+    let before = session.reporter.activity("observations");
+    let (observations, trained_points) = observe_all(data)?;
+    let trained_views = data.train.len() as i64;
+    session.reporter.activity(before);
     let mut builder = Builder::new();
     let net = PointEffects::new(&mut builder);
     let trainee = Trainee::new(builder.build(data.device, seed), plan.average_decay);
-    let unseen = unseen_pairs(&observations, seed);
+    let unseen = unseen_pairs(&observations, (trained_points, trained_views), seed);
     let stage = Stage {
         name: plan.stage,
         schedule: plan.schedule,
@@ -232,25 +214,23 @@ pub(crate) fn train_points(
     session.train(&stage, vec![trainee], |trainees, step, rate| {
         let trainee = &mut trainees[0];
         let mut rng = step_rng(seed, plan.stage, step);
-        let device = data.device;
-        let pick = indices(&mut rng, batch, observations.trained_points, device);
-        let other = indices(&mut rng, batch, observations.trained_views, device);
-        let Some(pairs) = Pairs::new(&observations, &pick, &other) else {
-            return 0.0;
+        let pick = indices(&mut rng, batch, trained_points, data.device);
+        let other = indices(&mut rng, batch, trained_views, data.device);
+        let descent = Descent {
+            rate: POINT_RATE * rate,
+            kind: plan.kind,
         };
-        let (here, there) = pairs.effects(&net, &trainee.params.in_kind(plan.kind));
-        let size = losses::sparsity(&here) + losses::sparsity(&there);
-        let loss = losses::pair(&pairs.with(&here, &there)) + size * (0.5 * SPARSITY);
-        let value = loss.double_value(&[]);
-        loss.backward();
-        trainee.step(POINT_RATE * rate, 1.0);
-        value
+        steps::point_step(&net, trainee, &observations, (&pick, &other), descent)
     })
 }
 
 /// Observations of validation views beside those of training views at the same points.
-fn unseen_pairs(all: &Observations, seed: u64) -> Vec<Pairs> {
-    let unseen = all.points.size()[0] - all.trained_points;
+fn unseen_pairs(
+    all: &Observations,
+    (trained_points, trained_views): (i64, i64),
+    seed: u64,
+) -> Vec<PointPairs> {
+    let unseen = all.points.size()[0] - trained_points;
     if unseen == 0 {
         return Vec::new();
     }
@@ -258,15 +238,15 @@ fn unseen_pairs(all: &Observations, seed: u64) -> Vec<Pairs> {
     (0..UNSEEN_BATCHES)
         .filter_map(|_| {
             let device = all.points.device();
-            let pick = indices(&mut rng, UNSEEN_BATCH, unseen, device) + all.trained_points;
-            let other = indices(&mut rng, UNSEEN_BATCH, all.trained_views, device);
-            Pairs::new(all, &pick, &other)
+            let pick = indices(&mut rng, UNSEEN_BATCH, unseen, device) + trained_points;
+            let other = indices(&mut rng, UNSEEN_BATCH, trained_views, device);
+            PointPairs::new(all, &pick, &other)
         })
         .collect()
 }
 
 /// Mean squared error, on [0, 255], of predicting validation views from training views and effects.
-fn unseen_error(unseen: &[Pairs], net: &PointEffects, params: &Params) -> Option<f64> {
+fn unseen_error(unseen: &[PointPairs], net: &PointEffects, params: &Params) -> Option<f64> {
     let errors = unseen.iter().map(|pairs| {
         no_grad(|| {
             let (here, there) = pairs.effects(net, params);
@@ -275,81 +255,6 @@ fn unseen_error(unseen: &[Pairs], net: &PointEffects, params: &Params) -> Option
     });
     let sum: f64 = errors.sum();
     (!unseen.is_empty()).then(|| sum / unseen.len() as f64 * 255.0 * 255.0)
-}
-
-/// Surface points that two views each see, with what they saw.
-struct Pairs {
-    /// [P, 3] each.
-    points: Tensor,
-    normals: Tensor,
-    to_here: Tensor,
-    to_there: Tensor,
-    color_here: Tensor,
-    color_there: Tensor,
-    /// [P, 1].
-    sound: Tensor,
-}
-
-impl Pairs {
-    /// What `other` ([N], views) sees at the points of observations `pick` ([N]); `None` when it sees none.
-    fn new(all: &Observations, pick: &Tensor, other: &Tensor) -> Option<Self> {
-        let points = all.points.index_select(0, pick);
-        let normals = all.normals.index_select(0, pick);
-        let taps = all.sources.taps(&points, &normals, other);
-        let same = all.views.index_select(0, pick).eq_tensor(other);
-        let valid = taps
-            .visibility
-            .gt(0.9)
-            .logical_and(&taps.facing.gt(0.3))
-            .logical_and(&same.logical_not());
-        let rows = valid.nonzero().view([-1]);
-        let n = rows.size()[0];
-        if n == 0 {
-            return None;
-        }
-        let cut = |t: &Tensor| t.index_select(0, &rows);
-        let (points, normals, pick) = (cut(&points), cut(&normals), cut(pick));
-        let flat = cut(&taps.index).view([-1]);
-        let alpha = all.source_alpha.index_select(0, &flat).view([n, 4]);
-        let weight = cut(&taps.weight) * alpha.to_kind(Kind::Float) / 255.0;
-        let total = weight.sum_dim_intlist([1i64].as_slice(), true, Kind::Float);
-        let picked = all
-            .source_colors
-            .index_select(0, &flat)
-            .view([n, 4, 3])
-            .to_kind(Kind::Float)
-            / 255.0;
-        let color_there =
-            (picked * weight.unsqueeze(2)).sum_dim_intlist([1i64].as_slice(), false, Kind::Float)
-                / total.clamp_min(1e-3);
-        let centers = all.sources.centers();
-        let towards = |views: &Tensor| directions(&centers.index_select(0, views), &points);
-        Some(Self {
-            to_here: towards(&all.views.index_select(0, &pick)),
-            to_there: towards(&cut(other)),
-            color_here: all.colors.index_select(0, &pick),
-            color_there,
-            sound: total.gt(0.9).to_kind(Kind::Float),
-            points,
-            normals,
-        })
-    }
-
-    /// Effects as seen from here and from there: [P, 3] each, linear light.
-    fn effects(&self, net: &PointEffects, params: &Params) -> (Tensor, Tensor) {
-        let seen_from = |to_viewer| net.forward(params, &self.points, &self.normals, to_viewer);
-        (seen_from(&self.to_here), seen_from(&self.to_there))
-    }
-
-    fn with<'a>(&'a self, here: &'a Tensor, there: &'a Tensor) -> Pair<'a> {
-        Pair {
-            color_here: &self.color_here,
-            color_there: &self.color_there,
-            effects_here: here,
-            effects_there: there,
-            sound: &self.sound,
-        }
-    }
 }
 
 /// Everything the paper's `EffectsNet` needs of one training view.

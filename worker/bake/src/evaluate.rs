@@ -10,6 +10,7 @@ use tch::Tensor;
 use crate::data::Scored;
 
 /// One method's images and figures.
+#[derive(Clone)]
 pub(crate) struct Row {
     pub(crate) metrics: MethodMetrics,
     pub(crate) images: Vec<RgbImage>,

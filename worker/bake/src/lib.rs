@@ -24,6 +24,7 @@ mod run;
 mod sampler;
 mod schedule;
 mod training;
+mod views;
 
 pub use error::BakeError;
 pub(crate) use error::io;

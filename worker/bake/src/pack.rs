@@ -129,8 +129,10 @@ pub(crate) fn pack(finished: Finished<'_>) -> Result<PathBuf, BakeError> {
         })
         .collect();
     writer.held_out_views(&held_out_views)?;
+    let before = reporter.activity("preview");
     let frames = turntable(data, model, settings.preview_frames, reporter);
     writer.file("preview.webp", &animation(&frames)?)?;
+    reporter.activity(before);
     if let Some(first) = frames.first() {
         writer.file(THUMBNAIL_FILE, &jpeg(first)?)?;
     }

@@ -27,7 +27,9 @@ struct State {
     first_percent: Option<f64>,
     last_sent: Option<Instant>,
     stage: &'static str,
-    stage_started: Instant,
+    /// Part of the stage whose time is kept apart; empty for the rest of it.
+    activity: &'static str,
+    activity_started: Instant,
     stages: Vec<(String, f64)>,
     error: Option<f64>,
 }
@@ -45,7 +47,8 @@ impl<'a> Reporter<'a> {
                 first_percent: None,
                 last_sent: None,
                 stage: "",
-                stage_started: now,
+                activity: "",
+                activity_started: now,
                 stages: Vec::new(),
                 error: None,
             }),
@@ -73,13 +76,21 @@ impl<'a> Reporter<'a> {
     pub(crate) fn stage(&self, stage: &'static str, message: &str) {
         {
             let mut state = self.state.borrow_mut();
-            close_stage(&mut state);
+            close_activity(&mut state);
             state.stage = stage;
+            state.activity = "";
             state.span = (0.0, 1.0);
             state.part = (0.0, 1.0);
             state.last_sent = None;
         }
         self.step(0.0, message);
+    }
+
+    /// Keeps the time from here on apart, as `STAGE: NAME`; an empty name is the rest of the stage. Returns the former name.
+    pub(crate) fn activity(&self, name: &'static str) -> &'static str {
+        let mut state = self.state.borrow_mut();
+        close_activity(&mut state);
+        std::mem::replace(&mut state.activity, name)
     }
 
     /// Reports progress within the stage, from 0 to 1.
@@ -148,10 +159,10 @@ impl<'a> Reporter<'a> {
         (self.sink)(event);
     }
 
-    /// Seconds per stage so far, in order.
+    /// Seconds per stage and activity so far, in order; together all the time since the first stage began.
     pub(crate) fn stages(&self) -> Vec<(String, f64)> {
         let mut state = self.state.borrow_mut();
-        close_stage(&mut state);
+        close_activity(&mut state);
         state.stages.clone()
     }
 }
@@ -171,18 +182,43 @@ fn shares(methods: usize) -> Shares {
         .collect()
 }
 
-fn close_stage(state: &mut State) {
-    let secs = state.stage_started.elapsed().as_secs_f64();
-    state.stage_started = Instant::now();
-    if state.stage.is_empty() {
-        return;
-    }
-    match state
-        .stages
-        .iter_mut()
-        .find(|(name, _)| name == state.stage)
-    {
+fn close_activity(state: &mut State) {
+    let secs = state.activity_started.elapsed().as_secs_f64();
+    state.activity_started = Instant::now();
+    let name = match (state.stage, state.activity) {
+        ("", _) => return,
+        (stage, "") => stage.to_owned(),
+        (stage, activity) => format!("{stage}: {activity}"),
+    };
+    match state.stages.iter_mut().find(|(known, _)| *known == name) {
         Some((_, total)) => *total += secs,
-        None => state.stages.push((state.stage.to_owned(), secs)),
+        None => state.stages.push((name, secs)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn activities_split_the_time_of_their_stage() {
+        let reporter = Reporter::new(&|_| {});
+        let wait = || std::thread::sleep(Duration::from_millis(5));
+        reporter.stage("plan", "");
+        wait();
+        reporter.stage("composition", "");
+        for _ in 0..2 {
+            let before = reporter.activity("steps");
+            wait();
+            assert_eq!(reporter.activity(before), "steps");
+            wait();
+        }
+        let stages = reporter.stages();
+        let names: Vec<&str> = stages.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(names, ["plan", "composition", "composition: steps"]);
+        assert!(
+            stages[1..].iter().all(|(_, secs)| *secs >= 0.01),
+            "{stages:?}"
+        );
     }
 }

@@ -248,6 +248,8 @@ pub(crate) struct Settings {
     /// Scored beside ours, in the order of [`Method::ALL`].
     pub(crate) methods: Vec<Method>,
     pub(crate) half_weights: bool,
+    /// Megabytes of memory for what training views show; beyond it they lie on disk.
+    pub(crate) cache_mb: u64,
     pub(crate) checkpoint_secs: f64,
     pub(crate) margin: f64,
     /// Whether the proxy's outline is brought to the masks.
@@ -326,6 +328,7 @@ impl Recipe {
             patch: 64,
             methods: Method::CHEAP.to_vec(),
             half_weights: false,
+            cache_mb: 2048,
             checkpoint_secs: 20.0,
             margin: 0.05,
             fit: true,
@@ -465,6 +468,7 @@ impl Settings {
             "patch" => self.patch = number(key, value, 16, 4096)?,
             "methods" => self.methods = methods(value)?,
             "half_weights" => self.half_weights = switch(key, value)?,
+            "cache_mb" => self.cache_mb = number(key, value, 0, 1 << 20)?,
             "checkpoint_secs" => self.checkpoint_secs = number(key, value, 0.0, 86_400.0)?,
             "margin" => self.margin = number(key, value, 0.0, 2.0)?,
             "fit" => self.fit = switch(key, value)?,
@@ -475,7 +479,7 @@ impl Settings {
                     format!("setting {key} is unknown"),
                     "known: k, train_views, references, supersample, drawing, effects, effects_net, head, loss, leave_out, shuffle, precision, adversarial, \
                      average_decay, rate, effects_steps, effects_batch, composition_steps, \
-                     batch, patch, methods, half_weights, checkpoint_secs, margin, gains, fit, simplify, preview_frames, quality, \
+                     batch, patch, methods, half_weights, cache_mb, checkpoint_secs, margin, gains, fit, simplify, preview_frames, quality, \
                      target_psnr, max_secs, max_bundle_mb, min_render_fps",
                 ));
             }

@@ -60,6 +60,7 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
     let scene = ign_capture::import(&job.capture_dir, &options)?;
     let mut settings = job.recipe.resolve(scene.train.len())?;
     reporter.expect(settings.trained_methods());
+    reporter.activity("preflight");
     reporter.step(0.2, "comparing the photographs at common surface points");
     let survey = Survey::new(&scene);
     let estimated = Gains::estimate(&scene, &survey);
@@ -75,7 +76,14 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
         GainsChoice::Auto => estimated,
         GainsChoice::Off => Gains::none(scene.views.len()),
     };
-    let mut data = Dataset::new(&scene, &gains, &job.recipe, &settings, device)?;
+    let mut data = Dataset::new(
+        &scene,
+        &gains,
+        &job.recipe,
+        &settings,
+        device,
+        &job.work_dir,
+    )?;
     reporter.info(format!(
         "{} views to train on, {} to validate, {} held out; device {}",
         data.train.len(),
@@ -98,12 +106,14 @@ pub fn bake(job: &BakeJob, events: &dyn Fn(Event)) -> Result<PathBuf, BakeError>
     reporter.step(0.1, "choosing reference views");
     // On the proxy as given: what a view covers must not hang on how coarse a proxy suffices.
     let chosen = data.choose_references(settings.references);
+    reporter.activity("proxy");
     reporter.step(0.2, "simplifying the proxy where no view shows it");
     data.settle_proxy(settings.simplify);
     reporter.info(data.proxy_words.clone());
     if let Some(words) = &fitted {
         reporter.info(words.clone());
     }
+    reporter.activity("views");
     reporter.step(0.4, "loading validation and held-out views");
     let fit = plan::fit(&mut data, &mut settings, chosen, &mut session)?;
     let (data, settings, drawn, chosen) = (data, settings, fit.drawn, fit.chosen);

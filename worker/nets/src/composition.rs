@@ -9,7 +9,7 @@
 //! and the full frame agree. The measured effect is in worker/nets/README.md.
 
 use crate::params::{Builder, Init, Params};
-use crate::unet::{Conv, UNet};
+use crate::unet::{Conv, UNet, laid_out, leaky_relu};
 use tch::{Kind, Tensor};
 
 /// Reductions keep the kind of their input, so that gradients can be checked in f64.
@@ -86,16 +86,26 @@ impl BlendInput {
         }
     }
 
-    /// Stacks inputs of one size along the batch.
-    pub fn batch(inputs: &[Self]) -> Self {
-        let cat = |pick: fn(&Self) -> &Tensor| {
-            Tensor::cat(&inputs.iter().map(pick).collect::<Vec<_>>(), 0)
-        };
+    /// [B, 5K + C, H, W]: all of it, plane by plane.
+    pub fn planes(&self) -> Tensor {
+        let candidates = self.candidates.flatten(1, 2);
+        Tensor::cat(
+            &[&candidates, &self.prior, &self.visibility, &self.target],
+            1,
+        )
+    }
+
+    /// From [`BlendInput::planes`] of `k` candidates.
+    pub fn of_planes(planes: &Tensor, k: usize) -> Self {
+        let size = planes.size();
+        let k = k as i64;
         Self {
-            candidates: cat(|i| &i.candidates),
-            prior: cat(|i| &i.prior),
-            visibility: cat(|i| &i.visibility),
-            target: cat(|i| &i.target),
+            candidates: planes
+                .narrow(1, 0, 3 * k)
+                .view([size[0], k, 3, size[2], size[3]]),
+            prior: planes.narrow(1, 3 * k, k),
+            visibility: planes.narrow(1, 4 * k, k),
+            target: planes.narrow(1, 5 * k, size[1] - 5 * k),
         }
     }
 
@@ -188,9 +198,8 @@ impl BlendComposition {
         );
         let step = 1i64 << self.down.len();
         let pad = |n: i64| (step - n % step) % step;
-        let x = x
-            .constant_pad_nd([0, pad(width), 0, pad(height)])
-            .to_kind(params.kind());
+        let x = x.constant_pad_nd([0, pad(width), 0, pad(height)]);
+        let x = laid_out(params, &x.to_kind(params.kind()));
         let mut x = activate(&self.stem.forward(params, &x));
         let mut skips = Vec::new();
         for (first, second) in &self.down {
@@ -211,7 +220,8 @@ impl BlendComposition {
             .forward(params, &x)
             .narrow(2, 0, height)
             .narrow(3, 0, width)
-            .to_kind(input.candidates.kind());
+            .to_kind(input.candidates.kind())
+            .contiguous();
         let seen = input.visibility.gt(0.0).to_kind(input.candidates.kind());
         let logits = (&input.prior + 1e-4).log() + out.narrow(1, 0, self.k) + (seen - 1.0) * 1e4;
         let generated_logit = out.narrow(1, self.k, 1) + GENERATED_LOGIT;
@@ -224,5 +234,5 @@ impl BlendComposition {
 }
 
 fn activate(x: &Tensor) -> Tensor {
-    x.maximum(&(x * 0.1))
+    leaky_relu(x, 0.1)
 }

@@ -2,15 +2,20 @@
 //!
 //! The paper uses Adam with a learning rate of 1e-3, beta1 = 0.9, beta2 = 0.999, epsilon = 1e-8 (Sec. "Training");
 //! those are the defaults here. A step whose gradient is not finite changes nothing and is counted.
+//!
+//! On the CPU the buffer is updated piece by piece, so that each is in the cache for all of its operations: memory is read
+//! and written once a step, not once an operation.
 
 use crate::params::{NetError, Params, flat_values};
-use tch::{Kind, Tensor, no_grad};
+use rayon::prelude::*;
+use tch::{Device, Tensor, no_grad};
 
 /// Optimiser state for one [`Params`].
 #[derive(Debug)]
 pub struct Adam {
     first: Tensor,
     second: Tensor,
+    /// The weights themselves where averaging is off.
     average: Tensor,
     steps: u64,
     skipped: u64,
@@ -46,15 +51,18 @@ impl Trainee {
         Self { params, adam }
     }
 
-    /// See [`Adam::step`].
-    pub fn step(&mut self, rate: f64, max_norm: f64) -> bool {
-        self.adam.step(&mut self.params, rate, max_norm)
+    /// One step down `loss`, a scalar that depends on the network's tensors; see [`Adam::step`].
+    pub fn descend(&mut self, loss: &Tensor, rate: f64, max_norm: f64) -> bool {
+        let gradient = self.params.gradient(loss);
+        self.adam.step(&self.params, &gradient, rate, max_norm)
     }
 }
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;
+/// Values of a piece: below the number from which torch splits an operation between threads.
+const PIECE: i64 = 24_576;
 
 impl Adam {
     /// Zero moments; the average starts at the present weights. `average_decay` of 0 switches averaging off.
@@ -62,45 +70,58 @@ impl Adam {
         Self {
             first: params.flat().zeros_like(),
             second: params.flat().zeros_like(),
-            average: params.flat().copy(),
+            average: if average_decay > 0.0 {
+                params.flat().copy()
+            } else {
+                params.flat().shallow_clone()
+            },
             steps: 0,
             skipped: 0,
             average_decay,
         }
     }
 
-    /// Applies the gradients of the last backward pass. Returns whether they were finite; if not, nothing changes.
+    /// Applies `gradient` ([N], see [`Params::gradient`]) to `params`. Returns whether it was finite; if not, nothing
+    /// changes.
     ///
     /// `max_norm` bounds the gradient's Euclidean norm (infinity: no bound).
-    pub fn step(&mut self, params: &mut Params, rate: f64, max_norm: f64) -> bool {
-        no_grad(|| {
-            let mut grad = params.take_grad();
-            let norm = grad.square().sum(Kind::Float).sqrt().double_value(&[]);
-            if !norm.is_finite() {
-                self.skipped += 1;
-                return false;
-            }
-            if norm > max_norm {
-                grad *= max_norm / norm;
-            }
-            self.steps += 1;
-            self.first *= BETA1;
-            self.first += &grad * (1.0 - BETA1);
-            self.second *= BETA2;
-            self.second += grad.square() * (1.0 - BETA2);
-            let correction1 = 1.0 - BETA1.powf(self.steps as f64);
-            let correction2 = 1.0 - BETA2.powf(self.steps as f64);
-            let denominator = (&self.second / correction2).sqrt() + EPSILON;
-            let mut flat = params.flat().shallow_clone();
-            flat -= &self.first / denominator * (rate / correction1);
+    pub fn step(&mut self, params: &Params, gradient: &Tensor, rate: f64, max_norm: f64) -> bool {
+        let norm = no_grad(|| gradient.norm().double_value(&[]));
+        if !norm.is_finite() {
+            self.skipped += 1;
+            return false;
+        }
+        self.steps += 1;
+        let steps = self.steps as f64;
+        let update = Update {
+            shrink: (norm > max_norm).then_some(max_norm / norm),
+            rate: rate / (1.0 - BETA1.powf(steps)),
+            root: (1.0 - BETA2.powf(steps)).sqrt().recip(),
             // The average forgets its start fast and its recent past slowly.
-            let decay = self
-                .average_decay
-                .min((1.0 + self.steps as f64) / (10.0 + self.steps as f64));
-            self.average *= decay;
-            self.average += &flat * (1.0 - decay);
-            true
+            forget: 1.0 - self.average_decay.min((1.0 + steps) / (10.0 + steps)),
+            averages: self.average_decay > 0.0,
+        };
+        let length = match params.device() {
+            Device::Cpu => PIECE,
+            _ => params.flat().size()[0].max(1),
+        };
+        let mut buffers = [
+            gradient,
+            &self.first,
+            &self.second,
+            params.flat(),
+            &self.average,
+        ]
+        .map(|buffer| buffer.split(length, 0).into_iter());
+        let pieces: Vec<[Tensor; 5]> = std::iter::from_fn(|| {
+            let [a, b, c, d, e] = &mut buffers;
+            Some([a.next()?, b.next()?, c.next()?, d.next()?, e.next()?])
         })
+        .collect();
+        pieces
+            .into_par_iter()
+            .for_each(|piece| no_grad(|| update.apply(piece)));
+        true
     }
 
     /// The network with averaged weights.
@@ -148,23 +169,57 @@ impl Adam {
     }
 }
 
+/// The factors of one step.
+#[derive(Clone, Copy)]
+struct Update {
+    /// Of the gradient.
+    shrink: Option<f64>,
+    /// Of the first moment over the root of the second.
+    rate: f64,
+    /// Of the root of the second moment.
+    root: f64,
+    /// Of the weights in their average.
+    forget: f64,
+    averages: bool,
+}
+
+impl Update {
+    fn apply(&self, [gradient, mut first, mut second, mut weights, mut average]: [Tensor; 5]) {
+        let gradient = match self.shrink {
+            Some(factor) => gradient * factor,
+            None => gradient,
+        };
+        drop(first.lerp_(&gradient, 1.0 - BETA1));
+        drop(second.lerp_(&gradient.square(), 1.0 - BETA2));
+        let mut step = second.sqrt();
+        step *= self.root;
+        step += EPSILON;
+        step = first / step;
+        step *= self.rate;
+        weights -= step;
+        if self.averages {
+            drop(average.lerp_(&weights, self.forget));
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::params::{Builder, Init};
-    use tch::Device;
+    use tch::Kind;
 
     /// Against `torch.optim.Adam` semantics worked by hand for a scalar.
     #[test]
     fn first_steps_follow_the_published_update() {
         let mut builder = Builder::new();
         let id = builder.param("x", &[1], Init::Constant(1.0));
-        let mut params = builder.build(Device::Cpu, 0);
+        let params = builder.build(Device::Cpu, 0);
         let mut adam = Adam::new(&params, 0.0);
         let (mut x, mut m, mut v) = (1.0f64, 0.0, 0.0);
         for t in 1..=5 {
-            params.get(id).square().sum(Kind::Float).backward();
-            assert!(adam.step(&mut params, 0.1, f64::INFINITY));
+            let gradient = params.gradient(&params.get(id).square().sum(Kind::Float));
+            assert!(adam.step(&params, &gradient, 0.1, f64::INFINITY));
             let g = 2.0 * x;
             m = 0.9 * m + 0.1 * g;
             v = 0.999 * v + 0.001 * g * g;
@@ -179,10 +234,10 @@ mod tests {
     fn a_gradient_that_is_not_finite_changes_nothing() {
         let mut builder = Builder::new();
         let id = builder.param("x", &[1], Init::Constant(0.0));
-        let mut params = builder.build(Device::Cpu, 0);
+        let params = builder.build(Device::Cpu, 0);
         let mut adam = Adam::new(&params, 0.9);
-        params.get(id).sqrt().sum(Kind::Float).backward();
-        assert!(!adam.step(&mut params, 0.1, 1.0));
+        let gradient = params.gradient(&params.get(id).sqrt().sum(Kind::Float));
+        assert!(!adam.step(&params, &gradient, 0.1, 1.0));
         assert_eq!(adam.skipped(), 1);
         assert!(params.get(id).double_value(&[0]).abs() < 1e-12);
     }

@@ -224,20 +224,32 @@ impl Params {
             .sum()
     }
 
-    /// [N] f32: the gradients of the last backward pass, 0 where there is none; clears them.
-    pub fn take_grad(&mut self) -> Tensor {
+    /// Whether what is computed from the tensors just now can be differentiated.
+    pub fn recorded(&self) -> bool {
+        let mut trained = self.leaves.iter().filter(|leaf| leaf.requires_grad());
+        trained
+            .next()
+            .is_some_and(|leaf| leaf.view([-1]).requires_grad())
+    }
+
+    /// [N], of the weights' kind: how a scalar `loss` changes with each value; 0 where it does not depend on it. Frees the
+    /// graph behind `loss`. Gradients of other networks in that graph are not computed.
+    pub fn gradient(&self, loss: &Tensor) -> Tensor {
+        let trained: Vec<&Tensor> = self
+            .leaves
+            .iter()
+            .filter(|leaf| leaf.requires_grad())
+            .collect();
+        let mut gradients = Tensor::run_backward(&[loss], &trained, false, false).into_iter();
         let parts: Vec<Tensor> = self
             .slots
             .iter()
-            .zip(&mut self.leaves)
+            .zip(&self.leaves)
             .map(|(slot, leaf)| {
-                let grad = leaf.grad();
-                if slot.trainable && grad.defined() {
-                    let flat = grad.view([-1]).copy();
-                    leaf.zero_grad();
-                    flat
-                } else {
-                    Tensor::zeros([slot.len()], (Kind::Float, leaf.device()))
+                let gradient = slot.trainable.then(|| gradients.next()).flatten();
+                match gradient.filter(Tensor::defined) {
+                    Some(gradient) => gradient.reshape([-1]),
+                    None => leaf.zeros_like().view([-1]),
                 }
             })
             .collect();
@@ -359,11 +371,22 @@ mod tests {
     }
 
     #[test]
-    fn gradients_arrive_once() {
-        let (mut params, a, _) = two();
-        (params.get(a) * 3.0).sum(Kind::Float).backward();
-        assert!((params.take_grad().sum(Kind::Float).double_value(&[]) - 18.0).abs() < 1e-6);
-        assert!(params.take_grad().abs().sum(Kind::Float).double_value(&[]) < 1e-12);
+    fn nothing_is_recorded_without_gradients() {
+        let (params, ..) = two();
+        assert!(params.recorded());
+        assert!(!no_grad(|| params.recorded()));
+    }
+
+    #[test]
+    fn gradients_do_not_add_up() {
+        let (params, a, _) = two();
+        for _ in 0..2 {
+            let gradient = params.gradient(&(params.get(a) * 3.0).sum(Kind::Float));
+            assert_eq!(
+                flat_values(&gradient),
+                [3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 0.0, 0.0, 0.0]
+            );
+        }
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //! The 70x70 variant: C64-C128-C256-C512 and a last convolution to one value per patch; 2.8 M parameters.
 
 use crate::params::{Builder, Params};
-use crate::unet::{BatchNorm, Conv};
+use crate::unet::{BatchNorm, Conv, leaky_relu};
 use tch::Tensor;
 
 /// `PatchGAN` discriminator.
@@ -52,7 +52,7 @@ impl PatchGan {
             if let Some(norm) = norm {
                 x = norm.forward(params, &x, train);
             }
-            x = x.maximum(&(&x * 0.2));
+            x = leaky_relu(&x, 0.2);
         }
         self.head.forward(params, &x)
     }

@@ -49,9 +49,8 @@ fn check(name: &str, x: &Tensor, samples: usize, f: &dyn Fn(&Tensor) -> Tensor) 
 /// The same for a network's parameters: `f` maps them to a scalar.
 fn check_params(name: &str, params: &Params, samples: usize, f: &dyn Fn(&Params) -> Tensor) {
     let flat = params.flat().to_kind(Kind::Double);
-    let mut leaf = params.with_flat(&flat);
-    f(&leaf).backward();
-    let exact: Vec<f64> = Vec::try_from(leaf.take_grad()).expect("f64 values");
+    let leaf = params.with_flat(&flat);
+    let exact: Vec<f64> = Vec::try_from(leaf.gradient(&f(&leaf))).expect("f64 values");
     let scale = exact.iter().fold(1e-3_f64, |most, g| most.max(g.abs()));
     let moved = |at: usize, by: f64| {
         let y = flat.copy();

@@ -28,7 +28,7 @@ pub(super) struct ViewErrors {
 pub(super) struct Truth {
     scene: Scene,
     /// Holds the photographs that `scene` loads.
-    _folder: tempfile::TempDir,
+    folder: tempfile::TempDir,
 }
 
 impl Truth {
@@ -46,17 +46,21 @@ impl Truth {
         copy(capture, folder.path())?;
         copy(&truth, &folder.path().join("images"))?;
         let scene = ign_capture::import(folder.path(), &ImportOptions::default())?;
-        Ok(Self {
-            scene,
-            _folder: folder,
-        })
+        Ok(Self { scene, folder })
     }
 
     /// Compares the bundle in `dir`, baked from this capture with `recipe`.
     pub(super) fn errors(&self, recipe: &Recipe, dir: &Path) -> Result<Vec<ViewErrors>, BakeError> {
         let settings = recipe.resolve(self.scene.train.len())?;
         let gains = Gains::none(self.scene.views.len());
-        let data = Dataset::new(&self.scene, &gains, recipe, &settings, Device::Cpu)?;
+        let data = Dataset::new(
+            &self.scene,
+            &gains,
+            recipe,
+            &settings,
+            Device::Cpu,
+            self.folder.path(),
+        )?;
         let renderer = BundleRenderer::open(dir, Device::Cpu)?;
         let bundle: &Bundle = renderer.bundle();
         data.held_out

@@ -241,6 +241,66 @@ fn resuming_gives_what_an_unbroken_bake_gives() {
     }
 }
 
+/// Where training views lie is no part of what is trained, broken off or not.
+#[test]
+fn a_cache_too_small_for_one_view_gives_the_same_bundle() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let capture = capture(dir.path(), 0.8);
+    let methods = ("methods", "n_ibr,pix2pix_depth");
+    let mut bundles = Vec::new();
+    for cache_mb in ["1000", "0"] {
+        let recipe = recipe(&[("checkpoint_secs", "0"), ("cache_mb", cache_mb), methods]);
+        let (kept, on_disk) = (RefCell::new(Vec::new()), RefCell::new(0));
+        let whole = job(&capture, &dir.path().join(cache_mb), recipe.clone());
+        let bundle = bake(&whole, &|event| match event {
+            Event::Checkpoint { path } => kept
+                .borrow_mut()
+                .push(std::fs::read(path).expect("a checkpoint")),
+            Event::Log { message, .. } => {
+                *on_disk.borrow_mut() += u32::from(message.contains("lie on disk"));
+            }
+            Event::Progress(_) | Event::Done { .. } | Event::Failed(_) => {}
+        })
+        .expect("a bake");
+        // Ours and the one compared with it.
+        assert_eq!(on_disk.into_inner(), if cache_mb == "0" { 2 } else { 0 });
+        bundles.push(bundle);
+        let work = std::fs::read_dir(&whole.work_dir).expect("a folder");
+        let mut left: Vec<_> = work
+            .map(|entry| entry.expect("an entry").file_name())
+            .collect();
+        left.sort_unstable();
+        assert_eq!(left, ["bundle", "checkpoints"]);
+        if cache_mb == "0" {
+            let checkpoint = dir.path().join("kept.safetensors");
+            let kept = kept.into_inner();
+            std::fs::write(&checkpoint, &kept[kept.len() / 2]).expect("written");
+            let resumed = BakeJob {
+                checkpoint: Some(checkpoint),
+                ..job(&capture, &dir.path().join("resumed"), recipe)
+            };
+            bundles.push(bake(&resumed, &|_| {}).expect("a resumed bake"));
+        }
+    }
+    let errors = |bundle: &Path| -> Vec<u64> {
+        let bundle = Bundle::open(bundle).expect("it verifies");
+        let metrics = bundle.metrics().expect("metrics").expect("metrics.json");
+        metrics
+            .methods
+            .iter()
+            .map(|row| row.mse.to_bits())
+            .collect()
+    };
+    for bundle in &bundles[1..] {
+        assert!(
+            weights(bundle) == weights(&bundles[0]),
+            "{}",
+            bundle.display()
+        );
+        assert_eq!(errors(bundle), errors(&bundles[0]), "{}", bundle.display());
+    }
+}
+
 #[test]
 fn a_checkpoint_that_cannot_be_used_starts_from_the_beginning() {
     let dir = tempfile::tempdir().expect("a folder");

@@ -189,10 +189,9 @@ impl Expected {
         );
     }
 
-    /// Compares a network's gradients, which are cleared.
-    fn check_gradients(&self, case: &str, params: &mut Params) {
-        let gradients = params.take_grad();
-        let gradients = params.with_flat(&gradients).export();
+    /// Compares how a loss changes with a network's tensors.
+    fn check_gradients(&self, case: &str, params: &Params, loss: &Tensor) {
+        let gradients = params.with_flat(&params.gradient(loss)).export();
         for name in self.names(case) {
             let (_, _, values) = find(&gradients, &name);
             let largest = values.iter().fold(0.0_f32, |most, g| most.max(g.abs()));
@@ -279,9 +278,9 @@ fn training_of_effects_net_agrees() {
         taps: &taps,
     };
     let (net, params) = effects_net();
-    let mut trainee = trainee(&params);
-    steps::effects_loss(&net, &trainee.params, &pair).backward();
-    expected.check_gradients("effects_gradient", &mut trainee.params);
+    let trainee = trainee(&params);
+    let loss = steps::effects_loss(&net, &trainee.params, &pair);
+    expected.check_gradients("effects_gradient", &trainee.params, &loss);
 
     let mut trainee = self::trainee(&params);
     let losses: Vec<f32> = (0..STEPS)
@@ -305,19 +304,17 @@ fn training_of_composition_net_agrees() {
         truth: &double(&truth()),
         coverage: &double(&tensor("coverage", &[BATCH, 1, HEIGHT, WIDTH], 0.0, 0.5)),
     };
-    let (mut generator, mut discriminator) = (trainee(&net_params), trainee(&critic_params));
+    let (generator, mut discriminator) = (trainee(&net_params), trainee(&critic_params));
     let image = gan.image(&generator.params, &example);
-    let criticise = |discriminator: &Trainee| {
-        gan.criticism(&discriminator.params, &example, &image)
-            .backward();
-    };
-    criticise(&discriminator);
-    expected.check_gradients("discriminator_gradient", &mut discriminator.params);
-    // The generator meets a discriminator that has made its step, whose gradients the comparison has taken.
-    criticise(&discriminator);
-    discriminator.step(RATE, f64::INFINITY);
-    gan.loss(&discriminator.params, &example, &image).backward();
-    expected.check_gradients("composition_gradient", &mut generator.params);
+    let criticism =
+        |discriminator: &Trainee| gan.criticism(&discriminator.params, &example, &image);
+    let loss = criticism(&discriminator);
+    expected.check_gradients("discriminator_gradient", &discriminator.params, &loss);
+    // The generator meets a discriminator that has made its step; the comparison has used the loss up.
+    let loss = criticism(&discriminator);
+    discriminator.descend(&loss, RATE, f64::INFINITY);
+    let loss = gan.loss(&discriminator.params, &example, &image);
+    expected.check_gradients("composition_gradient", &generator.params, &loss);
 
     let (mut generator, mut discriminator) = (trainee(&net_params), trainee(&critic_params));
     let losses: Vec<f32> = (0..STEPS)
