@@ -62,7 +62,8 @@ fn by_name() -> impl TypedValueParser<Value = Experiment> {
 
 /// A preset by its name.
 fn preset(name: &str) -> Result<Preset, String> {
-    serde_json::from_value(name.into()).map_err(|_| "expected auto, standard or paper".to_owned())
+    serde_json::from_value(name.into())
+        .map_err(|error| format!("expected auto, standard or paper: {error}"))
 }
 
 fn key_value(text: &str) -> Result<(String, String), String> {

@@ -311,7 +311,7 @@ impl<'a> Session<'a> {
                 self.reporter.activity("steps");
                 paused += pause.elapsed().as_secs_f64();
             }
-            let end = schedule.end(&current.course);
+            let end = current.course.end();
             if progress >= end {
                 break;
             }

@@ -2,6 +2,7 @@
 //! blends, whether there is time for a network at all. Each from a measurement on validation views or from a limit that
 //! the recipe states; held-out views decide nothing.
 
+use std::path::Path;
 use std::time::Instant;
 
 use ign_bundle::Reference;
@@ -333,6 +334,11 @@ fn png_bytes(images: &[ReferenceImage]) -> Result<Vec<f64>, BakeError> {
         })
         .collect();
     let files = ign_bundle::references::encode(&references)?;
-    let pictures = files.iter().filter(|(name, _)| name.ends_with(".png"));
+    let is_picture = |name: &str| {
+        Path::new(name)
+            .extension()
+            .is_some_and(|kind| kind == "png")
+    };
+    let pictures = files.iter().filter(|(name, _)| is_picture(name));
     Ok(pictures.map(|(_, bytes)| bytes.len() as f64).collect())
 }

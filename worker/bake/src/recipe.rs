@@ -202,6 +202,10 @@ pub(crate) enum GainsChoice {
 
 /// The recipe resolved: every number a bake needs.
 #[derive(Clone, Debug)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "independent switches, each of them a setting's name"
+)]
 pub(crate) struct Settings {
     pub(crate) preset: Preset,
     pub(crate) quality: Quality,

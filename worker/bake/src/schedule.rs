@@ -70,6 +70,11 @@ impl Course {
         self.tail.is_some()
     }
 
+    /// Progress at which the stage ends, as far as is known.
+    pub(crate) fn end(&self) -> f64 {
+        self.tail.map_or(1.0, |(_, end)| end)
+    }
+
     /// Whether these figures, read from a file, can be gone on from.
     pub(crate) fn holds(&self) -> bool {
         let share = |value: f64| (0.0..=1.0).contains(&value);
@@ -91,17 +96,12 @@ impl Schedule {
             .min(1.0)
     }
 
-    /// Progress at which the stage ends, as far as is known.
-    pub(crate) fn end(&self, course: &Course) -> f64 {
-        course.tail.map_or(1.0, |(_, end)| end)
-    }
-
     /// Whether the network is to be observed now.
     pub(crate) fn is_due(&self, course: &Course, step: u64, progress: f64) -> bool {
         let Some((last, _)) = course.observed.last() else {
             return true;
         };
-        if progress >= self.end(course) {
+        if progress >= course.end() {
             return true;
         }
         match self.rate {
@@ -171,7 +171,7 @@ mod tests {
                 seen.push(step);
                 schedule.observed(&mut course, step, progress, Some(error(step)));
             }
-            if progress >= schedule.end(&course) {
+            if progress >= course.end() {
                 return (seen, step, course);
             }
             let rate = schedule.rate(&course, step, progress);

@@ -176,29 +176,13 @@ impl Trainer<'_> {
         };
         let plain = self.drawn.plain(self.data);
         if self.settings.effects != EffectsChoice::Off {
-            self.begin(session, names, "effects", (0.0, share));
+            begin(session, names, "effects", (0.0, share));
         }
         let (model, effects) = self.with_effects(session, plain, names, share)?;
-        self.begin(session, names, "composition", (share, 1.0));
+        begin(session, names, "composition", (share, 1.0));
         let (model, composition) = self.with_composition(session, model, names, share)?;
         let secs = session.secs(names.effects) + session.secs(names.composition);
         Ok((Trained { model, secs }, effects, composition))
-    }
-
-    /// Begins a stage of the bake for `ours`, a part of the present one for what is compared with it.
-    fn begin(
-        &self,
-        session: &Session<'_>,
-        names: Names,
-        stage: &'static str,
-        (from, to): (f64, f64),
-    ) {
-        if names.method == OURS.method {
-            let message = format!("training {}Net", capitalised(stage));
-            session.reporter.stage(stage, &message);
-        } else {
-            session.reporter.part(from, to);
-        }
     }
 
     /// Error of plain blending with the model's effects on the validation views; measured once.
@@ -394,6 +378,16 @@ impl Trainer<'_> {
             PaperComposition::new(b, channels)
         })?;
         Ok(Composition::Paper(net, params))
+    }
+}
+
+/// Begins a stage of the bake for `ours`, a part of the present one for what is compared with it.
+fn begin(session: &Session<'_>, names: Names, stage: &'static str, (from, to): (f64, f64)) {
+    if names.method == OURS.method {
+        let message = format!("training {}Net", capitalised(stage));
+        session.reporter.stage(stage, &message);
+    } else {
+        session.reporter.part(from, to);
     }
 }
 

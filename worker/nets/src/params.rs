@@ -226,10 +226,11 @@ impl Params {
 
     /// Whether what is computed from the tensors just now can be differentiated.
     pub fn recorded(&self) -> bool {
-        let mut trained = self.leaves.iter().filter(|leaf| leaf.requires_grad());
+        let trained = self.leaves.iter().filter(|leaf| leaf.requires_grad());
+        // A view of a leaf claims it even where nothing is recorded; the smallest one is quick to compute with.
         trained
-            .next()
-            .is_some_and(|leaf| leaf.view([-1]).requires_grad())
+            .min_by_key(|leaf| leaf.numel())
+            .is_some_and(|leaf| leaf.neg().requires_grad())
     }
 
     /// [N], of the weights' kind: how a scalar `loss` changes with each value; 0 where it does not depend on it. Frees the
