@@ -28,6 +28,10 @@ pub(crate) enum End {
 }
 
 #[derive(Default)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "faults that a test switches on, each on its own"
+)]
 pub(crate) struct World {
     pub(crate) queue: VecDeque<v1::Lease>,
     pub(crate) blobs: HashMap<String, Vec<u8>>,
