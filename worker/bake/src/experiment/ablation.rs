@@ -280,7 +280,7 @@ mod tests {
     #[test]
     fn ratios_come_to_their_median_and_ends() {
         let figures = Ratios(vec![1.2, f64::NAN, 0.9, 1.0, 1.1]).figures();
-        assert_eq!(figures.map(|f| (f * 100.0).round()), [105.0, 90.0, 120.0]);
+        assert_eq!(figures.map(|f| (f * 100.0).round() as i64), [105, 90, 120]);
         assert!(Ratios::default().figures()[0].is_nan());
     }
 }
