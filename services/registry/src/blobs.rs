@@ -17,7 +17,6 @@ use object_store::{GetOptions, GetRange, ObjectStoreExt as _, PutPayload, WriteM
 use sha2::{Digest as _, Sha256};
 
 use crate::error::{BodyError, RegistryError, cut, store_error};
-use crate::journal::MAX_OBJECT_BYTES;
 use crate::store::Registry;
 
 /// Part of a multipart write, and the largest body that is written in one piece.
@@ -325,13 +324,11 @@ impl Registry {
     }
 
     pub(crate) async fn put(&self, path: &Path, payload: PutPayload) -> Result<(), RegistryError> {
-        let put = match &self.journal {
-            Some(journal) if payload.content_length() <= MAX_OBJECT_BYTES => {
-                journal.put(path, Bytes::from(payload)).await
-            }
-            _ => self.store.put(path, payload).await.map(drop),
-        };
-        put.map_err(store_error("write", path))
+        self.store
+            .put(path, payload)
+            .await
+            .map(drop)
+            .map_err(store_error("write", path))
     }
 
     /// An object of at most [`MAX_BYTES`]; none when absent.

@@ -8,22 +8,19 @@
 //! uploads/<id>/...                      parts of uploads that have not finished
 //! trash/blobs/<64 hex>/<uuid>           what nothing names any more, on its way out
 //! damaged/...                           what an audit found to be wrong
-//! journal/<uuid>.log                    in a folder: small objects that are not flushed to their files yet
 //! ```
 //!
 //! Everything needed to serve the published models lies in the bucket: [`Registry::rebuild`] reads it back.
 //!
 //! **Architecture invariant:** nothing here decides. The database is the only commit authority; this crate stores bytes
-//! under the name of their content and mirrors what the database decided. Hence no compare-and-swap, and no local state but
-//! what the journal of a folder holds until the disk has it: any number of coordinators may share one bucket, and each may
-//! be killed at any point. A store that does not honour conditional create (found at start, see [`Probe`]) costs nothing
-//! but a warning.
+//! under the name of their content and mirrors what the database decided. Hence no lock, no compare-and-swap and no
+//! local state: any number of coordinators may share one bucket, and each may be killed at any point. A store that does
+//! not honour conditional create (found at start, see [`Probe`]) costs nothing but a warning.
 
 mod audit;
 mod blobs;
 mod collect;
 mod error;
-mod journal;
 mod store;
 mod trash;
 mod uploads;

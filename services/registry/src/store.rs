@@ -14,7 +14,6 @@ use object_store::{ObjectStore, ObjectStoreExt as _, PutMode, RetryConfig};
 use uuid::Uuid;
 
 use crate::error::{RegistryError, store_error};
-use crate::journal::Journal;
 
 /// Address of an object store.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -34,10 +33,6 @@ impl StoreConfig {
             options: Vec::new(),
         }
     }
-
-    fn folder(&self) -> Option<&str> {
-        self.url.strip_prefix("file://")
-    }
 }
 
 /// What the store was found to do at start.
@@ -55,20 +50,13 @@ pub struct Registry {
     pub(crate) store: Arc<dyn ObjectStore>,
     signer: Option<Arc<dyn Signer>>,
     prefix: Path,
-    /// Of a folder that is open for writing.
-    pub(crate) journal: Option<Arc<Journal>>,
     probe: Probe,
 }
 
 impl Registry {
     /// Opens the store, checks that it can be written and read, and finds out what it can do.
     pub async fn open(config: &StoreConfig) -> Result<Self, RegistryError> {
-        let mut registry = Self::connect(config)?;
-        if let Some(folder) = config.folder() {
-            let journal = Journal::open(folder.into()).await;
-            registry.journal = Some(journal.map_err(store_error("open", &Path::from("journal")))?);
-        }
-        let registry = registry.prepared().await?;
+        let registry = Self::connect(config)?.prepared().await?;
         if !registry.probe.conditional_create {
             tracing::warn!(
                 store.url = config.url,
@@ -138,7 +126,6 @@ impl Registry {
             },
             signer,
             prefix,
-            journal: None,
         }
     }
 
