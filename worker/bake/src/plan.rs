@@ -161,7 +161,7 @@ fn fewest_references(data: &Dataset<'_>, drawn: &mut Drawn, session: &Session<'_
     fewest.map_or(all, |at| counts[at])
 }
 
-/// Takes the first manner of rendering that is fast enough, else the fastest.
+/// Takes the first manner of rendering that is fast enough, else the one that does the least.
 fn fit_speed(
     data: &mut Dataset<'_>,
     settings: &mut Settings,
@@ -212,8 +212,8 @@ fn fit_speed(
             (manner, session.measured(&name, rate))
         })
         .collect();
-    let fastest = timed.iter().max_by(|a, b| a.1.total_cmp(&b.1));
-    let Some(&(manner, reached)) = timed.iter().find(|(_, rate)| *rate >= fps).or(fastest) else {
+    let fast_enough = timed.iter().find(|(_, rate)| *rate >= fps);
+    let Some(&(manner, reached)) = fast_enough.or(timed.last()) else {
         return String::new();
     };
     settings.k = manner.k;
@@ -226,7 +226,7 @@ fn fit_speed(
         if reached >= fps {
             "reached with"
         } else {
-            "the nearest to it is"
+            "not reached; the least that can be done is"
         },
         manner.k,
         manner.supersample,

@@ -22,9 +22,9 @@ const AUTO_ONLY: [&str; 5] = [
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Preset {
-    /// What the scene needs: each part only if it pays, and only for as long as it does.
+    /// What the scene needs: each part only if it pays, and only for as long as it does; what `ignctl` asks for by itself.
     Auto,
-    /// Everything that measured best, with a fixed length; the default.
+    /// Everything that measured best, with a fixed length; what a recipe means that names no preset.
     #[default]
     Standard,
     /// The paper's networks, losses and schedule.
@@ -140,9 +140,9 @@ impl Quality {
     /// Share by which a doubling of a training must lower the error.
     fn least_gain(self) -> f64 {
         match self {
-            Self::Draft => 0.15,
+            Self::Draft => 0.12,
             Self::Standard => 0.05,
-            Self::Best => 0.015,
+            Self::Best => 0.02,
         }
     }
 
@@ -377,11 +377,13 @@ impl Settings {
         }
     }
 
-    /// How the networks of `ours` learn; `enough` is the error at which more is not wanted.
-    pub(crate) fn rate(&self, enough: Option<f64>) -> Rate {
+    /// How the networks of `ours` learn: with preset `auto` for at least so many steps; `enough` is the error at which more is
+    /// not wanted.
+    pub(crate) fn rate(&self, least_steps: u64, enough: Option<f64>) -> Rate {
         match self.preset {
             Preset::Auto => Rate::WhileItPays(Worth {
                 least_gain: self.quality.least_gain(),
+                least_steps,
                 enough,
             }),
             _ if self.constant_rate => Rate::Constant,

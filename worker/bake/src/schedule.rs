@@ -1,8 +1,11 @@
 //! How long a stage trains, and how fast it learns meanwhile.
 //!
-//! A stage whose end is known lowers its learning rate along a cosine from start to end. One that trains
-//! [while it pays](Rate::WhileItPays) learns at its peak rate until a doubling of its length no longer lowers the error on
-//! validation views by enough, then lowers the rate over another third of what it took so far, and ends.
+//! The learning rate falls with the root of a stage's steps, so that the weights are nearly settled wherever it ends, and over
+//! the last quarter along a cosine to almost nothing. A stage that trains [while it pays](Rate::WhileItPays) begins that end
+//! once a doubling of its length no longer lowers the error on validation views by enough.
+//!
+//! Against a cosine over the whole stage, as long: matte demo vase, 64 px, 1000 steps, held-out error 7.15 with the cosine, 6.94
+//! with the root.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,17 +13,17 @@ use serde::{Deserialize, Serialize};
 const WARM_STEPS: u64 = 20;
 /// What the rate falls to, as a share of its peak.
 const LOWEST_RATE: f64 = 0.02;
-/// Length of the falling end of a stage that trained while it paid, as a share of what it took before.
+/// Step from which on the rate falls with the root of the steps.
+const KNEE: f64 = 50.0;
+/// Length of the falling end, as a share of what the stage took before.
 const TAIL: f64 = 1.0 / 3.0;
 /// Observations of a stage whose end is known, beside the one at its start.
 const OBSERVATIONS: u64 = 8;
 /// Step of the first observation of a stage that trains while it pays; the next ones are a factor apart.
 const FIRST_OBSERVED: u64 = 64;
-const OBSERVED_APART: f64 = std::f64::consts::SQRT_2;
+const OBSERVED_APART: f64 = 1.19;
 /// An observation counts as one at half the length up to this share.
 const HALF: f64 = 0.55;
-/// Steps before which nothing is decided: the first ones tell little about the rest.
-const LEAST_STEPS: u64 = 180;
 
 /// How long a stage trains at most, and at what rate.
 #[derive(Clone, Copy, Debug)]
@@ -35,9 +38,9 @@ pub(crate) struct Schedule {
 pub(crate) enum Rate {
     /// The paper's.
     Constant,
-    /// Along a cosine, from the stage's start to its end.
-    Falling,
     /// See the module.
+    Falling,
+    /// The same, to an end that is decided on the way.
     WhileItPays(Worth),
 }
 
@@ -46,6 +49,8 @@ pub(crate) enum Rate {
 pub(crate) struct Worth {
     /// Share by which a doubling of the stage's length must lower the validation error.
     pub(crate) least_gain: f64,
+    /// Steps before which nothing is decided: the first ones tell little about the rest.
+    pub(crate) least_steps: u64,
     /// Validation error at which the stage ends at once.
     pub(crate) enough: Option<f64>,
 }
@@ -115,15 +120,15 @@ impl Schedule {
 
     /// Learning rate as a share of its peak.
     pub(crate) fn rate(&self, course: &Course, step: u64, progress: f64) -> f64 {
-        let (from, to) = match self.rate {
-            Rate::Constant => return 1.0,
-            Rate::Falling => (0.0, 1.0),
-            Rate::WhileItPays(_) => course.tail.unwrap_or((1.0 / (1.0 + TAIL), 1.0)),
-        };
+        if let Rate::Constant = self.rate {
+            return 1.0;
+        }
+        let (from, to) = course.tail.unwrap_or((1.0 / (1.0 + TAIL), 1.0));
         let warm = ((step + 1) as f64 / WARM_STEPS as f64).min(1.0);
+        let root = 1.0 / (1.0 + step as f64 / KNEE).sqrt();
         let fallen = ((progress - from) / (to - from).max(1e-9)).clamp(0.0, 1.0);
         let cosine = 0.5 * (1.0 + (std::f64::consts::PI * fallen).cos());
-        warm * (LOWEST_RATE + (1.0 - LOWEST_RATE) * cosine)
+        warm * root * (LOWEST_RATE + (1.0 - LOWEST_RATE) * cosine)
     }
 
     /// Takes in an observation and decides whether the stage goes on.
@@ -149,7 +154,7 @@ impl Schedule {
         }
         let mut earlier = course.observed.iter().rev();
         let half = earlier.find(|(at, _)| *at <= HALF * progress);
-        if step >= LEAST_STEPS
+        if step >= worth.least_steps
             && let Some((_, Some(before))) = half
             && 1.0 - lowest / before.max(1e-9) < worth.least_gain
         {
@@ -161,6 +166,8 @@ impl Schedule {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const LEAST_STEPS: u64 = 180;
 
     /// Trains without a network: `error` of the step's number. The steps observed, and the last one.
     fn run(schedule: &Schedule, error: impl Fn(u64) -> f64) -> (Vec<u64>, u64, Course) {
@@ -186,6 +193,7 @@ mod tests {
             budget_secs: None,
             rate: Rate::WhileItPays(Worth {
                 least_gain: 0.05,
+                least_steps: LEAST_STEPS,
                 enough,
             }),
         }
@@ -202,7 +210,10 @@ mod tests {
         assert_eq!((seen.len(), last), (9, 100));
         assert!(schedule.rate(&course, 99, 0.99) < 0.021);
         assert!(schedule.rate(&course, 0, 0.0) < 0.06);
-        assert!(schedule.rate(&course, 20, 0.0) > 0.99);
+        assert!(schedule.rate(&course, 20, 0.2) > 0.8);
+        // Four times the steps, half the rate.
+        let ratio = schedule.rate(&course, 750, 0.7) / schedule.rate(&course, 150, 0.7);
+        assert!((ratio - 0.5).abs() < 1e-9, "{ratio}");
         assert!((schedule.progress(10, 40.0) - 0.8).abs() < 1e-12);
         let constant = Schedule {
             rate: Rate::Constant,
@@ -220,7 +231,7 @@ mod tests {
         let falling = |step: u64| (step.max(1) as f64).powf(-0.15);
         let (seen, last, course) = run(&pays(None), falling);
         assert_eq!(last, 4000);
-        assert!(!course.ended_early() && seen.len() < 16, "{seen:?}");
+        assert!(!course.ended_early() && seen.len() < 28, "{seen:?}");
         let (_, last, _) = run(&pays(None), |step| falling(step.min(1000)));
         assert!((1400..3000).contains(&last), "{last}");
     }

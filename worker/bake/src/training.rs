@@ -27,6 +27,10 @@ const COMPOSITION_GAIN: f64 = 0.03;
 const EFFECTS_SHARE: f64 = 0.25;
 const PAPER_EFFECTS_SHARE: f64 = 0.3;
 
+/// With preset `auto`, steps before which nothing is decided about the rest of a training.
+const LEAST_EFFECTS_STEPS: u64 = 100;
+const LEAST_COMPOSITION_STEPS: u64 = 500;
+
 /// What one training is called: its row of metrics.json, and its stages in checkpoints.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Names {
@@ -225,7 +229,7 @@ impl Trainer<'_> {
             let schedule = Schedule {
                 steps: settings.effects_steps,
                 budget_secs: self.budget_secs.map(|secs| secs * share),
-                rate: settings.rate(None),
+                rate: settings.rate(LEAST_EFFECTS_STEPS, None),
             };
             let plan = effects::Plan {
                 stage: names.effects,
@@ -310,7 +314,7 @@ impl Trainer<'_> {
             schedule: Schedule {
                 steps: settings.composition_steps,
                 budget_secs,
-                rate: settings.rate(settings.enough_mse()),
+                rate: settings.rate(LEAST_COMPOSITION_STEPS, settings.enough_mse()),
             },
             seed: self.seed,
             secs_before: effects_secs,

@@ -1,12 +1,13 @@
 //! Preset `auto`: what does not pay is left out, limits hold or are refused; and bfloat16 beside single precision.
 
+use std::cell::RefCell;
 use std::path::Path;
 
-use ign_bake::{Preset, Recipe, bake};
+use ign_bake::{Event, Preset, Recipe, bake};
 use ign_bundle::{Bundle, Metrics};
 use serde_json::Value;
 
-use crate::{capture, job, recipe};
+use crate::{capture, job, recipe, weights};
 
 /// Bakes with preset `auto`; the figures and the plan.
 fn auto(dir: &Path, name: &str, capture: &Path, settings: &[(&str, &str)]) -> (Metrics, Value) {
@@ -47,6 +48,45 @@ fn a_matte_object_gets_no_effects_and_trains_briefly() {
     let (ours, naive) = (metrics.method("ours"), metrics.method("n_ibr"));
     assert!(ours.expect("a row").mse < 1.05 * naive.expect("a row").mse);
     assert!(says(&plan, "no EffectsNet"), "{plan:#}");
+}
+
+#[test]
+fn a_training_broken_off_in_its_falling_end_ends_where_it_would_have() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let capture = capture(dir.path(), 0.0);
+    let settings = [
+        ("effects", "on"),
+        ("effects_steps", "400"),
+        ("checkpoint_secs", "0"),
+    ];
+    let recipe = Recipe {
+        preset: Preset::Auto,
+        ..recipe(&settings)
+    };
+    let bake = |name: &str, checkpoint, seen: &dyn Fn(Event)| {
+        let mut job = job(&capture, &dir.path().join(name), recipe.clone());
+        job.checkpoint = checkpoint;
+        bake(&job, seen).expect("a bake")
+    };
+    let effects_steps = |bundle: &Path| {
+        let bundle = Bundle::open(bundle).expect("it verifies");
+        steps(&bundle.manifest().plan, "effects")
+    };
+    let kept = RefCell::new(Vec::new());
+    let whole = bake("whole", None, &|event| {
+        if let Event::Checkpoint { path } = event {
+            let copy = path.with_extension(format!("kept{}", kept.borrow().len()));
+            std::fs::copy(path, &copy).expect("a copy");
+            kept.borrow_mut().push(copy);
+        }
+    });
+    // Effects do not pay; the last quarter of what they trained is the falling end.
+    let trained = effects_steps(&whole);
+    assert!(trained < 800, "{trained} steps");
+    let checkpoint = kept.borrow()[trained as usize * 9 / 10].clone();
+    let resumed = bake("resumed", Some(checkpoint), &|_| {});
+    assert_eq!(effects_steps(&resumed), trained);
+    assert!(weights(&resumed) == weights(&whole), "other weights");
 }
 
 #[test]
