@@ -18,7 +18,7 @@ BIN = $${CARGO_TARGET_DIR:-target}/debug
 
 CAPTURE =
 OBJECT =
-PRESET = auto
+PRESET = standard
 OUT =
 ARGS =
 BENCH =

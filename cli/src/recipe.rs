@@ -25,8 +25,8 @@ const METHODS: [&str; 9] = [
 #[derive(Clone, Debug, clap::Args)]
 #[command(next_help_heading = "Recipe")]
 pub(crate) struct RecipeArgs {
-    /// What to train: `auto` what the scene needs and for as long as it pays, `standard` everything for a fixed time, `paper` the published method
-    #[arg(long, value_parser = ["auto", "standard", "paper"], default_value = "auto")]
+    /// What to train: `auto` only what the scene needs, `standard` everything for a fixed time, `paper` the published method
+    #[arg(long, value_parser = ["auto", "standard", "paper"], default_value = "standard")]
     pub(crate) preset: String,
     /// Longer side of the rendered images, in pixels
     #[arg(long, value_name = "PX", default_value_t = 256, value_parser = clap::value_parser!(u32).range(16..=8192))]

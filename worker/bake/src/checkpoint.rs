@@ -714,6 +714,7 @@ mod tests {
             schedule: Schedule {
                 steps: 64,
                 budget_secs: None,
+                knee: 1.0,
                 rate: Rate::Constant,
             },
             watch: watched.then_some(watch),
@@ -811,6 +812,7 @@ mod tests {
             schedule: Schedule {
                 steps: 64,
                 budget_secs: None,
+                knee: 1.0,
                 rate: Rate::Constant,
             },
             watch: Some(watch()),

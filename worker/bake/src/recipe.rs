@@ -22,9 +22,9 @@ const AUTO_ONLY: [&str; 5] = [
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Preset {
-    /// What the scene needs: each part only if it pays, and only for as long as it does; what `ignctl` asks for by itself.
+    /// What the scene needs: each part only if it pays, and only for as long as it does.
     Auto,
-    /// Everything that measured best, with a fixed length; what a recipe means that names no preset.
+    /// Everything that measured best, with a fixed length; the default.
     #[default]
     Standard,
     /// The paper's networks, losses and schedule.

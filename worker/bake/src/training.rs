@@ -31,6 +31,10 @@ const PAPER_EFFECTS_SHARE: f64 = 0.3;
 const LEAST_EFFECTS_STEPS: u64 = 100;
 const LEAST_COMPOSITION_STEPS: u64 = 500;
 
+/// Steps from which on learning rates fall.
+const EFFECTS_KNEE: f64 = 500.0;
+const COMPOSITION_KNEE: f64 = 50.0;
+
 /// What one training is called: its row of metrics.json, and its stages in checkpoints.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Names {
@@ -229,6 +233,7 @@ impl Trainer<'_> {
             let schedule = Schedule {
                 steps: settings.effects_steps,
                 budget_secs: self.budget_secs.map(|secs| secs * share),
+                knee: EFFECTS_KNEE,
                 rate: settings.rate(LEAST_EFFECTS_STEPS, None),
             };
             let plan = effects::Plan {
@@ -314,6 +319,7 @@ impl Trainer<'_> {
             schedule: Schedule {
                 steps: settings.composition_steps,
                 budget_secs,
+                knee: COMPOSITION_KNEE,
                 rate: settings.rate(LEAST_COMPOSITION_STEPS, settings.enough_mse()),
             },
             seed: self.seed,
