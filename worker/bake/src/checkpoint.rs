@@ -714,7 +714,6 @@ mod tests {
             schedule: Schedule {
                 steps: 64,
                 budget_secs: None,
-                knee: 1.0,
                 rate: Rate::Constant,
             },
             watch: watched.then_some(watch),
@@ -812,7 +811,6 @@ mod tests {
             schedule: Schedule {
                 steps: 64,
                 budget_secs: None,
-                knee: 1.0,
                 rate: Rate::Constant,
             },
             watch: Some(watch()),

@@ -90,7 +90,6 @@ fn rival(
             schedule: Schedule {
                 steps,
                 budget_secs,
-                knee: 1.0,
                 rate: Rate::Constant,
             },
             seed: trainer.seed,

@@ -377,17 +377,18 @@ impl Settings {
         }
     }
 
-    /// How the networks of `ours` learn: with preset `auto` for at least so many steps; `enough` is the error at which more is
-    /// not wanted.
-    pub(crate) fn rate(&self, least_steps: u64, enough: Option<f64>) -> Rate {
+    /// How a network of `ours` learns: its rate falls from step `knee` on; `enough` is the error at which more is not wanted.
+    pub(crate) fn rate(&self, knee: f64, enough: Option<f64>) -> Rate {
         match self.preset {
-            Preset::Auto => Rate::WhileItPays(Worth {
-                least_gain: self.quality.least_gain(),
-                least_steps,
-                enough,
-            }),
+            Preset::Auto => Rate::WhileItPays {
+                knee,
+                worth: Worth {
+                    least_gain: self.quality.least_gain(),
+                    enough,
+                },
+            },
             _ if self.constant_rate => Rate::Constant,
-            _ => Rate::Falling,
+            _ => Rate::Falling { knee },
         }
     }
 

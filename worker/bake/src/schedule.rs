@@ -19,17 +19,17 @@ const TAIL: f64 = 1.0 / 3.0;
 const OBSERVATIONS: u64 = 8;
 /// Step of the first observation of a stage that trains while it pays; the next ones are a factor apart.
 const FIRST_OBSERVED: u64 = 64;
-const OBSERVED_APART: f64 = 1.19;
+const OBSERVED_APART: f64 = std::f64::consts::SQRT_2;
 /// An observation counts as one at half the length up to this share.
 const HALF: f64 = 0.55;
+/// Steps before which nothing is decided: the first ones tell little about the rest.
+const LEAST_STEPS: u64 = 250;
 
 /// How long a stage trains at most, and at what rate.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Schedule {
     pub(crate) steps: u64,
     pub(crate) budget_secs: Option<f64>,
-    /// Step from which on the rate falls with the root of the steps.
-    pub(crate) knee: f64,
     pub(crate) rate: Rate,
 }
 
@@ -39,9 +39,16 @@ pub(crate) enum Rate {
     /// The paper's.
     Constant,
     /// See the module.
-    Falling,
+    Falling {
+        /// Step from which on it falls.
+        knee: f64,
+    },
     /// The same, to an end that is decided on the way.
-    WhileItPays(Worth),
+    WhileItPays {
+        /// Step from which on it falls.
+        knee: f64,
+        worth: Worth,
+    },
 }
 
 /// What more training must bring.
@@ -49,8 +56,6 @@ pub(crate) enum Rate {
 pub(crate) struct Worth {
     /// Share by which a doubling of the stage's length must lower the validation error.
     pub(crate) least_gain: f64,
-    /// Steps before which nothing is decided: the first ones tell little about the rest.
-    pub(crate) least_steps: u64,
     /// Validation error at which the stage ends at once.
     pub(crate) enough: Option<f64>,
 }
@@ -110,22 +115,22 @@ impl Schedule {
             return true;
         }
         match self.rate {
-            Rate::Constant | Rate::Falling => {
+            Rate::Constant | Rate::Falling { .. } => {
                 progress * OBSERVATIONS as f64 >= course.observed.len() as f64
             }
-            Rate::WhileItPays(_) if course.observed.len() == 1 => step >= FIRST_OBSERVED,
-            Rate::WhileItPays(_) => course.tail.is_none() && progress >= last * OBSERVED_APART,
+            Rate::WhileItPays { .. } if course.observed.len() == 1 => step >= FIRST_OBSERVED,
+            Rate::WhileItPays { .. } => course.tail.is_none() && progress >= last * OBSERVED_APART,
         }
     }
 
     /// Learning rate as a share of its peak.
     pub(crate) fn rate(&self, course: &Course, step: u64, progress: f64) -> f64 {
-        if let Rate::Constant = self.rate {
+        let (Rate::Falling { knee } | Rate::WhileItPays { knee, .. }) = self.rate else {
             return 1.0;
-        }
+        };
         let (from, to) = course.tail.unwrap_or((1.0 / (1.0 + TAIL), 1.0));
         let warm = ((step + 1) as f64 / WARM_STEPS as f64).min(1.0);
-        let root = 1.0 / (1.0 + step as f64 / self.knee).sqrt();
+        let root = 1.0 / (1.0 + step as f64 / knee).sqrt();
         let fallen = ((progress - from) / (to - from).max(1e-9)).clamp(0.0, 1.0);
         let cosine = 0.5 * (1.0 + (std::f64::consts::PI * fallen).cos());
         warm * root * (LOWEST_RATE + (1.0 - LOWEST_RATE) * cosine)
@@ -144,7 +149,8 @@ impl Schedule {
             (before, now) => before.or(now),
         };
         course.observed.push((progress, lowest));
-        let (Rate::WhileItPays(worth), Some(lowest), None) = (self.rate, lowest, course.tail)
+        let (Rate::WhileItPays { worth, .. }, Some(lowest), None) =
+            (self.rate, lowest, course.tail)
         else {
             return;
         };
@@ -154,7 +160,7 @@ impl Schedule {
         }
         let mut earlier = course.observed.iter().rev();
         let half = earlier.find(|(at, _)| *at <= HALF * progress);
-        if step >= worth.least_steps
+        if step >= LEAST_STEPS
             && let Some((_, Some(before))) = half
             && 1.0 - lowest / before.max(1e-9) < worth.least_gain
         {
@@ -166,8 +172,6 @@ impl Schedule {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const LEAST_STEPS: u64 = 180;
 
     /// Trains without a network: `error` of the step's number. The steps observed, and the last one.
     fn run(schedule: &Schedule, error: impl Fn(u64) -> f64) -> (Vec<u64>, u64, Course) {
@@ -191,12 +195,13 @@ mod tests {
         Schedule {
             steps: 4000,
             budget_secs: None,
-            knee: 50.0,
-            rate: Rate::WhileItPays(Worth {
-                least_gain: 0.05,
-                least_steps: LEAST_STEPS,
-                enough,
-            }),
+            rate: Rate::WhileItPays {
+                knee: 50.0,
+                worth: Worth {
+                    least_gain: 0.05,
+                    enough,
+                },
+            },
         }
     }
 
@@ -205,8 +210,7 @@ mod tests {
         let schedule = Schedule {
             steps: 100,
             budget_secs: Some(50.0),
-            knee: 50.0,
-            rate: Rate::Falling,
+            rate: Rate::Falling { knee: 50.0 },
         };
         let (seen, last, course) = run(&schedule, |_| 1.0);
         assert_eq!((seen.len(), last), (9, 100));
@@ -233,7 +237,7 @@ mod tests {
         let falling = |step: u64| (step.max(1) as f64).powf(-0.15);
         let (seen, last, course) = run(&pays(None), falling);
         assert_eq!(last, 4000);
-        assert!(!course.ended_early() && seen.len() < 28, "{seen:?}");
+        assert!(!course.ended_early() && seen.len() < 16, "{seen:?}");
         let (_, last, _) = run(&pays(None), |step| falling(step.min(1000)));
         assert!((1400..3000).contains(&last), "{last}");
     }

@@ -27,10 +27,6 @@ const COMPOSITION_GAIN: f64 = 0.03;
 const EFFECTS_SHARE: f64 = 0.25;
 const PAPER_EFFECTS_SHARE: f64 = 0.3;
 
-/// With preset `auto`, steps before which nothing is decided about the rest of a training.
-const LEAST_EFFECTS_STEPS: u64 = 100;
-const LEAST_COMPOSITION_STEPS: u64 = 500;
-
 /// Steps from which on learning rates fall.
 const EFFECTS_KNEE: f64 = 500.0;
 const COMPOSITION_KNEE: f64 = 50.0;
@@ -233,8 +229,7 @@ impl Trainer<'_> {
             let schedule = Schedule {
                 steps: settings.effects_steps,
                 budget_secs: self.budget_secs.map(|secs| secs * share),
-                knee: EFFECTS_KNEE,
-                rate: settings.rate(LEAST_EFFECTS_STEPS, None),
+                rate: settings.rate(EFFECTS_KNEE, None),
             };
             let plan = effects::Plan {
                 stage: names.effects,
@@ -319,8 +314,7 @@ impl Trainer<'_> {
             schedule: Schedule {
                 steps: settings.composition_steps,
                 budget_secs,
-                knee: COMPOSITION_KNEE,
-                rate: settings.rate(LEAST_COMPOSITION_STEPS, settings.enough_mse()),
+                rate: settings.rate(COMPOSITION_KNEE, settings.enough_mse()),
             },
             seed: self.seed,
             secs_before: effects_secs,
