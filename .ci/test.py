@@ -8,15 +8,18 @@ a failed step other than the tests counts as one failure. The exit status is 0 o
 """
 
 import glob
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+import threading
 import time
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 NO_TORCH = ["-p", "ignctl", "-p", "ign-coordinator"]
+END_TO_END = "ign-e2e"
 KUBERNETES_VALIDATE = "1.37.0"
 RESULT = re.compile(r"^test result: \w+\. (\d+) passed; (\d+) failed;")
 
@@ -91,26 +94,56 @@ def manifests_hold():
     return run(sys.executable, "services/deploy/check.py", binaries, env={"PYTHONPATH": packages})
 
 
+def test_targets():
+    """What `cargo test` is to run, in two lists of arguments: end-to-end tests, and all others."""
+    command = ["cargo", "metadata", "--locked", "--no-deps", "--format-version", "1"]
+    metadata = json.loads(subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout)
+    end_to_end, others = set(), set()
+    for package in metadata["packages"]:
+        names = {target["name"] for target in package["targets"] if "test" in target["kind"]}
+        (end_to_end if package["name"] == END_TO_END else others).update(names)
+    if both := end_to_end & others:
+        raise SystemExit(f"test: error: tests of one name are in {END_TO_END} and elsewhere: {', '.join(sorted(both))}")
+    chosen = lambda names: [word for name in sorted(names) for word in ("--test", name)]
+    return chosen(end_to_end), ["--lib", "--bins", *chosen(others)]
+
+
+def run_stream(prefix, commands, totals):
+    """Runs test commands one after the other; adds what passed and failed to `totals`."""
+    # Idle OpenMP threads of parallel tests would spin against each other.
+    env = {"OMP_NUM_THREADS": "1", "RUST_LIB_BACKTRACE": "0", **os.environ}
+    for command in commands:
+        say("$ " + " ".join(command))
+        failed = 0
+        with subprocess.Popen(
+            command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+        ) as tests:
+            for line in tests.stdout:
+                print(prefix + line, end="", flush=True)
+                if result := RESULT.match(line):
+                    totals.append((int(result[1]), int(result[2])))
+                    failed += int(result[2])
+        # A test binary that was killed prints no result.
+        if tests.returncode != 0 and failed == 0:
+            totals.append((0, 1))
+
+
 def run_tests():
     """All tests; passed and failed."""
     # The binaries that end-to-end tests start are built by the same command and profile as the tests.
     if not run("cargo", "build", "--locked", "--workspace", "--all-targets"):
         return 0, 1
-    command = ["cargo", "test", "--locked", "--workspace", "--no-fail-fast"]
-    say("$ " + " ".join(command))
-    passed = failed = 0
-    # Idle OpenMP threads of parallel tests would spin against each other.
-    env = {"OMP_NUM_THREADS": "1", "RUST_LIB_BACKTRACE": "0", **os.environ}
-    with subprocess.Popen(command, cwd=ROOT, env=env, stdout=subprocess.PIPE, text=True, errors="replace") as tests:
-        for line in tests.stdout:
-            print(line, end="", flush=True)
-            if result := RESULT.match(line):
-                passed += int(result[1])
-                failed += int(result[2])
-    # A test binary that was killed prints no result.
-    if tests.returncode != 0 and failed == 0:
-        failed = 1
-    return passed, failed
+    end_to_end, others = test_targets()
+    test = ["cargo", "test", "--locked", "--workspace", "--no-fail-fast"]
+    # End-to-end tests wait for processes more than they compute: the others run beside them, and give way.
+    totals = []
+    started = time.monotonic()
+    waiting = threading.Thread(target=run_stream, args=("e2e| ", [[*test, *end_to_end]], totals))
+    waiting.start()
+    run_stream("", [["nice", *test, *others], ["nice", *test, "--doc"]], totals)
+    waiting.join()
+    say(f"tests ended after {time.monotonic() - started:.0f} s")
+    return tuple(sum(column) for column in zip(*totals)) if totals else (0, 1)
 
 
 def main():
