@@ -14,10 +14,9 @@ from typing import Callable
 class Case:
     name: str
     does: str
-    package: str
-    """Crate, and the name of its benchmark target with fixed arguments."""
     bench: str
     arguments: tuple[str, ...]
+    """Of the benchmark target."""
     peer: str
     unit: str
     views: int
@@ -36,10 +35,9 @@ class ServiceCase:
     """A benchmark program that starts its own peers, and prints its figures with their targets."""
     name: str
     does: str
-    package: str
     bench: str
     programs: tuple[str, ...]
-    """Crates whose programs it starts."""
+    """What it starts."""
 
 
 def mesh_bytes(result):
@@ -56,7 +54,7 @@ def network(name, net, does, steps, frames):
     for work, unit, count, what in [("train", "step", steps, "training steps"), ("render", "frame", frames, "frames of 256 px")]:
         yield Case(
             name=f"{name}_{work}", does=f"{what}: {does[work]}",
-            package="ign-nets", bench="networks", arguments=("--net", net, "--work", work),
+            bench="networks", arguments=("--net", net, "--work", work),
             peer="torch_networks.py", unit=unit, views=count, requirements="requirements-torch.txt",
         )
 
@@ -80,7 +78,7 @@ CASES = [
     Case(
         name="depth",
         does="depth and triangle of each pixel (Drawable::rasterize); peer: Open3D RaycastingScene, casting alone",
-        package="ign-geometry", bench="gbuffers", arguments=("--maps", "depth"),
+        bench="gbuffers", arguments=("--maps", "depth"),
         peer="open3d_depth.py", unit="view", views=1000,
         limit_bytes=lambda r: mesh_bytes(r) + map_bytes(r, 8),
         limit_means="the visible half of the mesh read once, 8 bytes a pixel written once",
@@ -88,7 +86,7 @@ CASES = [
     Case(
         name="gbuffers",
         does="all maps of a G-buffer (Drawable::g_buffer); peer: the same as for depth, so it does less",
-        package="ign-geometry", bench="gbuffers", arguments=("--maps", "all"),
+        bench="gbuffers", arguments=("--maps", "all"),
         peer="open3d_depth.py", unit="view", views=1000,
         limit_bytes=lambda r: mesh_bytes(r) + map_bytes(r, 61),
         limit_means="the visible half of the mesh read once, 61 bytes a pixel written once",
@@ -96,7 +94,7 @@ CASES = [
     Case(
         name="selection",
         does="20 references by lazy greedy (select::Candidates::choose); peer: the same greedy, every gain, in NumPy",
-        package="ign-geometry", bench="selection", arguments=(),
+        bench="selection", arguments=(),
         peer="numpy_greedy.py", unit="view", views=1000, peer_runs=1,
         limit_bytes=lambda r: r["table_bytes"] * (1 + len(r["check"]["chosen"])) / r["items"],
         limit_means="the tables of costs, rays and weights read once for the first gains and once per choice",
@@ -104,7 +102,7 @@ CASES = [
     Case(
         name="import",
         does="24-megapixel JPEGs to 512 px around the object (Scene::load_view); peer: OpenCV imread, remap, INTER_AREA",
-        package="ign-capture", bench="import", arguments=(),
+        bench="import", arguments=(),
         peer="opencv_import.py", unit="view", views=1000,
         limit_bytes=lambda r: r["photograph_bytes"] + r["output_bytes"],
         limit_means="the file read once, the picture written once",
@@ -112,7 +110,7 @@ CASES = [
     Case(
         name="import_draft",
         does="the same; peer: Pillow in draft mode at 1/4, mesh transform for the lens, box filter",
-        package="ign-capture", bench="import", arguments=(),
+        bench="import", arguments=(),
         peer="pillow_import.py", unit="view", views=1000,
         limit_bytes=lambda r: r["photograph_bytes"] + r["output_bytes"],
         limit_means="the file read once, the picture written once",
@@ -124,6 +122,6 @@ SERVICES = [
     ServiceCase(
         name="service",
         does="coordinator, Postgres and SQLite under load through gRPC and HTTP; peers: pgbench -N, curl to the S3 server",
-        package="ign-e2e", bench="service", programs=("ign-coordinator", "ignctl", "ign-testkit"),
+        bench="service", programs=("ign-coordinator", "ignctl", "s3-endpoint"),
     ),
 ]

@@ -47,29 +47,24 @@ def environment(requirements):
 
 
 def build(cases):
-    """Path of each benchmark program, by crate and name."""
+    """Path of each benchmark program by its name; what it starts lies beside them."""
+    command = ["cargo", "build", "--release", "--locked", "--workspace", "--message-format", "json-render-diagnostics"]
+    for name in sorted({case.bench for case in cases}):
+        command += ["--bench", name]
+    for name in sorted({name for case in cases for name in getattr(case, "programs", ())}):
+        command += ["--bin", name]
+    say("$ " + " ".join(command))
+    output = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
     programs = {}
-    for package in sorted({case.package for case in cases}):
-        names = sorted({case.bench for case in cases if case.package == package})
-        command = ["cargo", "bench", "--locked", "--no-run", "--message-format", "json-render-diagnostics", "-p", package]
-        for name in names:
-            command += ["--bench", name]
-        say("$ " + " ".join(command))
-        output = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
-        for line in output.splitlines():
-            message = json.loads(line)
-            if message.get("executable") and message["target"]["kind"] == ["bench"]:
-                programs[package, message["target"]["name"]] = message["executable"]
+    for line in output.splitlines():
+        message = json.loads(line)
+        if message.get("executable") and message["target"]["kind"] == ["bench"]:
+            programs[message["target"]["name"]] = message["executable"]
     return programs
 
 
 def measure_service(case, program, arguments):
     """Figures of a program that brings its own peers; it says what it is at on stderr, among the logs of what it runs."""
-    command = ["cargo", "build", "--release", "--locked", "--bins"]
-    for package in case.programs:
-        command += ["-p", package]
-    say("$ " + " ".join(command))
-    subprocess.run(command, cwd=ROOT, check=True)
     with subprocess.Popen([program, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
         tail = []
         for line in running.stderr:
@@ -228,9 +223,9 @@ def main():
     limited = [case for case in cases if case.limit_bytes]
     python = environment(limited[0].requirements) if limited else None
     bandwidths = {threads: bandwidth(python, threads) for threads in options.threads if limited}
-    results = [measure(case, programs[case.package, case.bench], options, bandwidths) for case in cases]
+    results = [measure(case, programs[case.bench], options, bandwidths) for case in cases]
     figures = [
-        measure_service(case, programs[case.package, case.bench], ["--rounds", str(options.rounds), *options.service.split()])
+        measure_service(case, programs[case.bench], ["--rounds", str(options.rounds), *options.service.split()])
         for case in services
     ]
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
