@@ -226,6 +226,9 @@ impl fmt::Display for Attempt {
     }
 }
 
+/// The alias that every new version of an object takes over.
+pub const LATEST: &str = "latest";
+
 /// An object with its collection, written `collection/object`.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct ObjectName {

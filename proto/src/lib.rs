@@ -15,7 +15,7 @@ pub mod status;
 
 pub use grant::{Grant, Scope};
 pub use ids::{
-    Attempt, CollectionId, Digest, FilePath, IdError, JobId, ObjectId, ObjectName, WorkerId,
+    Attempt, CollectionId, Digest, FilePath, IdError, JobId, LATEST, ObjectId, ObjectName, WorkerId,
 };
 pub use manifest::{FileEntry, Kind, Manifest};
 pub use status::Cause;

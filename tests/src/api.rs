@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::{Context as _, Result};
 use ign_proto::v1::bundles_client::BundlesClient;
 use ign_proto::v1::jobs_client::JobsClient;
-use ign_proto::{Digest, FileEntry, Kind, Manifest, v1};
+use ign_proto::{Digest, FileEntry, Kind, Manifest, ObjectName, v1};
 use tonic::transport::{Channel, Endpoint};
 
 const LIMIT: Duration = Duration::from_secs(30);
@@ -128,6 +128,19 @@ impl Api {
         // A stream lasts as long as the job: no limit of time here.
         let channel = Endpoint::from_shared(self.url.clone())?.connect_lazy();
         Ok(JobsClient::new(channel).watch(request).await?.into_inner())
+    }
+
+    /// Names a version of an object of the form `collection/object`.
+    pub async fn set_alias(&self, object: &str, reference: &str, alias: &str) -> Result<()> {
+        let request = self.with_token(v1::SetAliasRequest {
+            object: Some((&object.parse::<ObjectName>()?).into()),
+            reference: reference.to_owned(),
+            alias: alias.to_owned(),
+        })?;
+        BundlesClient::new(self.channel.clone())
+            .set_alias(request)
+            .await?;
+        Ok(())
     }
 
     /// Everything that is published, retired versions too.

@@ -100,7 +100,7 @@ impl Bundles for BundlesApi {
             .set_alias(&object, &request.reference, &request.alias)
             .await
             .map_err(Refused::from)?;
-        self.0.mirror(&version).await;
+        self.0.mirror(&object).await;
         tracing::info!(object = %object, version = version.version, alias = request.alias, "alias moved");
         Ok(Response::new(to_bundle(version)))
     }
@@ -116,7 +116,7 @@ impl Bundles for BundlesApi {
             .retire(&object, &request.reference)
             .await
             .map_err(Refused::from)?;
-        self.0.mirror(&version).await;
+        self.0.mirror(&object).await;
         tracing::info!(object = %object, version = version.version, "version retired");
         self.record("retire", &version).await?;
         Ok(Response::new(to_bundle(version)))
@@ -139,7 +139,7 @@ impl Bundles for BundlesApi {
             .restore(&object, &format!("v{}", version.version))
             .await
             .map_err(Refused::from)?;
-        app.mirror(&version).await;
+        app.mirror(&object).await;
         tracing::info!(object = %object, version = version.version, "version restored");
         self.record("restore", &version).await?;
         Ok(Response::new(to_bundle(version)))

@@ -6,11 +6,11 @@
 //! 2. The manifest is written; nobody names it yet.
 //! 3. The database, under the job's row lock and after checking the attempt, makes it version N and ends the job. This
 //!    alone is the commit.
-//! 4. The bucket gets the version's record and the object's aliases.
+//! 4. The bucket gets the version's record. That it is the latest now, the record says by itself.
 //!
-//! A crash between 3 and 4 is repaired by [`App::mirror_all`] at start; a store that failed is tried again by the
-//! maintenance task. Aliases are written as the database has them at that time, and read again afterwards until both
-//! agree, so that two writers end at the newer state.
+//! What users name and retire gets to the bucket as the object's state, as the database has it at that time; it is read
+//! again afterwards until both agree, so that two writers end at the newer state. A crash between a commit and its copy is
+//! repaired by [`App::mirror_all`] at start; a store that failed is tried again by the maintenance task.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Mutex;
@@ -60,28 +60,33 @@ impl App {
             .publish_and_complete(job, attempt, bundle)
             .await?;
         ign_faults::point("publish.committed");
-        self.mirror(&version).await;
+        let recorded = self.record(std::slice::from_ref(&version)).await;
+        self.retry_later(&version.object, recorded);
         Ok(version)
     }
 
-    /// Brings the bucket's copy of a version and of its object up to date. A failure is logged and tried again later:
-    /// what the database committed stands.
-    pub(crate) async fn mirror(&self, version: &Version) {
-        self.mirror_object(&version.object, std::slice::from_ref(version))
-            .await;
+    /// Brings the bucket's copy of what users may change of an object up to date.
+    pub(crate) async fn mirror(&self, object: &ObjectName) {
+        let mirrored = self.mirror_state(object).await;
+        self.retry_later(object, mirrored);
     }
 
-    async fn mirror_object(&self, object: &ObjectName, versions: &[Version]) {
-        if let Err(Refused(cause)) = self.try_mirror(object, versions).await {
+    /// A failure is logged and mended later: what the database committed stands.
+    fn retry_later(&self, object: &ObjectName, outcome: Result<(), Refused>) {
+        if let Err(Refused(cause)) = outcome {
             tracing::warn!(object = %object, error = %cause, "the bucket's record of versions is behind; trying again later");
             self.mirror.behind().insert(object.clone());
         }
     }
 
-    async fn try_mirror(&self, object: &ObjectName, versions: &[Version]) -> Result<(), Refused> {
+    async fn record(&self, versions: &[Version]) -> Result<(), Refused> {
         for version in versions {
             self.registry.put_version(&record(version)).await?;
         }
+        Ok(())
+    }
+
+    async fn mirror_state(&self, object: &ObjectName) -> Result<(), Refused> {
         let mut standing = self.store.standing(object).await?;
         loop {
             self.registry.put_state(object, &state(&standing)).await?;
@@ -130,7 +135,9 @@ impl App {
         }
         stream::iter(objects)
             .for_each_concurrent(OBJECTS_IN_FLIGHT, |(object, versions)| async move {
-                self.mirror_object(&object, &versions).await;
+                let recorded = self.record(&versions).await;
+                self.retry_later(&object, recorded);
+                self.mirror(&object).await;
             })
             .await;
         Ok(())
@@ -156,6 +163,7 @@ fn state(standing: &Standing) -> ObjectState {
         .filter_map(|(version, at)| Some((*version, (*at)?)))
         .collect();
     ObjectState {
+        newest: standing.newest,
         aliases: standing.aliases.clone(),
         retired: standing.retired.keys().copied().collect(),
         retired_at,

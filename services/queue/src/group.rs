@@ -1,7 +1,8 @@
 //! Calls that come while a transaction runs share the next one.
 //!
 //! A commit costs a flush of the disk and as many round trips for one job as for thirty. The first of the calls that
-//! wait runs for all of them; nobody waits for company, so a call that comes alone is served at once. Groups come in
+//! wait runs for all of them; nobody waits for company, so a call that comes alone is served at once. One runs at a time:
+//! with two, groups are half as large, and 64 workers got a tenth less done (`make bench BENCH=service`). Groups come in
 //! powers of two: a statement's text depends on its number of rows, and so few texts stay prepared.
 //!
 //! A caller that leaves while it runs for others costs them a turn: they ask again. So only what may be asked twice is
@@ -10,7 +11,6 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use tokio::sync::Semaphore;
 use tokio::sync::oneshot::{self, error::TryRecvError};
 
 /// Calls in one transaction: few enough that the first does not wait long for the last.
@@ -20,18 +20,19 @@ const MAX_CALLS: usize = 32;
 #[derive(Debug)]
 pub(crate) struct Group<Ask, Answer> {
     waiting: Mutex<VecDeque<(Ask, oneshot::Sender<Answer>)>>,
-    turns: Semaphore,
+    turn: tokio::sync::Mutex<()>,
+}
+
+impl<Ask, Answer> Default for Group<Ask, Answer> {
+    fn default() -> Self {
+        Self {
+            waiting: Mutex::default(),
+            turn: tokio::sync::Mutex::default(),
+        }
+    }
 }
 
 impl<Ask, Answer> Group<Ask, Answer> {
-    /// So many transactions run at a time.
-    pub(crate) fn new(at_once: usize) -> Self {
-        Self {
-            waiting: Mutex::default(),
-            turns: Semaphore::new(at_once),
-        }
-    }
-
     /// The answer to `ask`, from `run` called here or by another caller; it gives one answer for each.
     pub(crate) async fn join<Run, Ran>(&self, ask: Ask, run: Run) -> Answer
     where
@@ -57,7 +58,7 @@ impl<Ask, Answer> Group<Ask, Answer> {
         let _turn = tokio::select! {
             biased;
             answered = &mut answer => return answered.ok(),
-            turn = self.turns.acquire() => turn,
+            turn = self.turn.lock() => turn,
         };
         loop {
             match answer.try_recv() {
@@ -98,7 +99,7 @@ mod tests {
 
     #[tokio::test]
     async fn each_call_gets_its_own_answer_and_calls_that_wait_share_a_run() {
-        let (group, runs) = (Arc::new(Group::new(2)), Arc::new(AtomicUsize::new(0)));
+        let (group, runs) = (Arc::new(Group::default()), Arc::new(AtomicUsize::new(0)));
         let calls = (0..100_usize).map(|number| {
             let (group, runs) = (group.clone(), runs.clone());
             tokio::spawn(async move {
@@ -122,7 +123,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_caller_that_leaves_in_the_middle_costs_the_others_a_turn() {
-        let group = Arc::new(Group::<u8, u8>::new(1));
+        let group = Arc::new(Group::<u8, u8>::default());
         let caller = |number: u8, runs: bool| {
             let group = group.clone();
             tokio::spawn(async move {

@@ -19,7 +19,7 @@ use uuid::Uuid;
 use crate::changes::{Change, Signal};
 use crate::store::{Result, Settings, StoreError};
 
-#[path = "sql.rs"]
+#[path = "sql/mod.rs"]
 mod sql;
 
 pub use sql::SqlStore as PostgresStore;
@@ -43,16 +43,13 @@ fn migrations() -> sqlx::migrate::Migrator {
     migrations
 }
 
-// What sql.rs needs of its dialect.
+// What sql needs of its dialect.
 type Db = Postgres;
 type Connection = PgConnection;
 type DbTime = DateTime<Utc>;
 const LOCK: &str = "for no key update";
 const LOCK_FREE_ROWS: &str = "for no key update skip locked";
 const ALIAS_LIST: &str = "string_agg(a.alias, ',')";
-
-/// Transactions of one kind at a time: one waits for the disk while another reads.
-const GROUPS_AT_ONCE: usize = 2;
 
 /// The pool, and the tasks that pass changes on; they end with the last store.
 #[derive(Debug)]

@@ -20,7 +20,7 @@ use sqlx::{QueryBuilder, Sqlite, SqliteConnection, SqlitePool, Transaction};
 use crate::changes::Signal;
 use crate::store::{Result, Settings, StoreError};
 
-#[path = "sql.rs"]
+#[path = "sql/mod.rs"]
 #[expect(
     clippy::duplicate_mod,
     reason = "one text for two dialects; see its module doc"
@@ -30,8 +30,6 @@ mod sql;
 pub use sql::SqlStore as SqliteStore;
 
 const READERS: u32 = 4;
-/// One writer, so one transaction.
-const GROUPS_AT_ONCE: usize = 1;
 
 /// What brings the schema up to date. One that is ahead, because a newer coordinator was here, is worked with: each step
 /// leaves the program before it working.
@@ -41,7 +39,7 @@ fn migrations() -> sqlx::migrate::Migrator {
     migrations
 }
 
-// What sql.rs needs of its dialect.
+// What sql needs of its dialect.
 type Db = Sqlite;
 type Connection = SqliteConnection;
 type DbTime = i64;

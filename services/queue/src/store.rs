@@ -253,6 +253,8 @@ pub struct Version {
 /// What of an object's versions may change; all else of a version stays as it was published.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Standing {
+    /// Number of the newest version, listed or not.
+    pub newest: u32,
     /// Alias to version.
     pub aliases: BTreeMap<String, u32>,
     /// Versions taken out of listings, and since when, where that is known.

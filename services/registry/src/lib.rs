@@ -4,7 +4,7 @@
 //! blobs/sha256/ab/<64 hex>              files of captures, bundles and checkpoints
 //! manifests/sha256/ab/<64 hex>          OCI image manifests that list them
 //! versions/<collection>/<object>/v3.json  which manifest is version 3, and where it came from; written once
-//! versions/<collection>/<object>/state.json  aliases and retired versions, rewritten on change
+//! versions/<collection>/<object>/state.json  what users named and retired, rewritten on change
 //! uploads/<id>/...                      parts of uploads that have not finished
 //! trash/blobs/<64 hex>/<uuid>           what nothing names any more, on its way out
 //! damaged/...                           what an audit found to be wrong

@@ -48,6 +48,8 @@ pub struct Probe {
 #[derive(Clone, Debug)]
 pub struct Registry {
     pub(crate) store: Arc<dyn ObjectStore>,
+    /// The same place, for what [`crate::versions`] writes: a local disk is not made to flush it.
+    pub(crate) records: Arc<dyn ObjectStore>,
     signer: Option<Arc<dyn Signer>>,
     prefix: Path,
     probe: Probe,
@@ -68,7 +70,9 @@ impl Registry {
 
     /// On a store that is open already; its URLs are not signed.
     pub async fn on(store: Arc<dyn ObjectStore>) -> Result<Self, RegistryError> {
-        Self::new(store, None, Path::default()).prepared().await
+        Self::new(store.clone(), store, None, Path::default())
+            .prepared()
+            .await
     }
 
     /// For reading alone: nothing is written, not even to try the store out.
@@ -77,49 +81,53 @@ impl Registry {
             url: config.url.clone(),
             reason,
         };
-        let (store, signer, prefix): (Arc<dyn ObjectStore>, Option<Arc<dyn Signer>>, Path) =
-            match config.url.split_once("://") {
-                Some(("file", folder)) if folder.starts_with('/') => {
-                    std::fs::create_dir_all(folder).map_err(|error| wrong(error.to_string()))?;
-                    let local = LocalFileSystem::new_with_prefix(folder)
-                        .map_err(|error| wrong(error.to_string()))?
-                        .with_fsync(true);
-                    (Arc::new(local), None, Path::default())
+        match config.url.split_once("://") {
+            Some(("file", folder)) if folder.starts_with('/') => {
+                std::fs::create_dir_all(folder).map_err(|error| wrong(error.to_string()))?;
+                let open = |flushed| {
+                    LocalFileSystem::new_with_prefix(folder)
+                        .map(|local| Arc::new(local.with_fsync(flushed)))
+                        .map_err(|error| wrong(error.to_string()))
+                };
+                Ok(Self::new(open(true)?, open(false)?, None, Path::default()))
+            }
+            Some(("s3", rest)) => {
+                let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
+                if bucket.is_empty() {
+                    return Err(wrong("it names no bucket".to_owned()));
                 }
-                Some(("s3", rest)) => {
-                    let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
-                    if bucket.is_empty() {
-                        return Err(wrong("it names no bucket".to_owned()));
-                    }
-                    let prefix = Path::parse(prefix).map_err(|error| wrong(error.to_string()))?;
-                    let mut builder = AmazonS3Builder::from_env()
-                        .with_bucket_name(bucket)
-                        .with_retry(RetryConfig {
-                            max_retries: 3,
-                            retry_timeout: Duration::from_secs(15),
-                            ..RetryConfig::default()
-                        });
-                    for (key, value) in &config.options {
-                        let key = key
-                            .parse()
-                            .map_err(|error: object_store::Error| wrong(error.to_string()))?;
-                        builder = builder.with_config(key, value);
-                    }
-                    let s3 = Arc::new(builder.build().map_err(|error| wrong(error.to_string()))?);
-                    (s3.clone(), Some(s3), prefix)
+                let prefix = Path::parse(prefix).map_err(|error| wrong(error.to_string()))?;
+                let mut builder = AmazonS3Builder::from_env()
+                    .with_bucket_name(bucket)
+                    .with_retry(RetryConfig {
+                        max_retries: 3,
+                        retry_timeout: Duration::from_secs(15),
+                        ..RetryConfig::default()
+                    });
+                for (key, value) in &config.options {
+                    let key = key
+                        .parse()
+                        .map_err(|error: object_store::Error| wrong(error.to_string()))?;
+                    builder = builder.with_config(key, value);
                 }
-                _ => {
-                    return Err(wrong(
-                        "expected file:///folder or s3://bucket/prefix".to_owned(),
-                    ));
-                }
-            };
-        Ok(Self::new(store, signer, prefix))
+                let s3 = Arc::new(builder.build().map_err(|error| wrong(error.to_string()))?);
+                Ok(Self::new(s3.clone(), s3.clone(), Some(s3), prefix))
+            }
+            _ => Err(wrong(
+                "expected file:///folder or s3://bucket/prefix".to_owned(),
+            )),
+        }
     }
 
-    fn new(store: Arc<dyn ObjectStore>, signer: Option<Arc<dyn Signer>>, prefix: Path) -> Self {
+    fn new(
+        store: Arc<dyn ObjectStore>,
+        records: Arc<dyn ObjectStore>,
+        signer: Option<Arc<dyn Signer>>,
+        prefix: Path,
+    ) -> Self {
         Self {
             store,
+            records,
             probe: Probe {
                 conditional_create: false,
                 signs_urls: signer.is_some(),

@@ -3,6 +3,12 @@
 //!
 //! Invariant: a version's record is written once. Its bytes depend only on what the database committed, so writing it
 //! again (after a crash between commit and write) gives the same object.
+//!
+//! A publication writes its record alone: a new version takes over [`LATEST`], whatever that named before, and changes
+//! nothing else of the object. What a user names or retires is written to the object's state.
+//!
+//! A local disk is not made to flush these copies, which would take as long as flushing the manifest: the database has
+//! flushed what they say, and a start writes again what a power cut took.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,11 +16,12 @@ use bytes::Bytes;
 use chrono::{DateTime, Utc};
 use futures::{StreamExt as _, TryStreamExt as _};
 use ign_proto::manifest::{Kind, Manifest};
-use ign_proto::{Digest, JobId, ObjectName};
+use ign_proto::{Digest, JobId, LATEST, ObjectName};
+use object_store::ObjectStoreExt as _;
 use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 
-use crate::error::RegistryError;
+use crate::error::{RegistryError, store_error};
 use crate::store::Registry;
 
 const READS_IN_FLIGHT: usize = 8;
@@ -41,6 +48,9 @@ pub struct VersionRecord {
 /// `versions/<collection>/<object>/state.json`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ObjectState {
+    /// Number of the newest version then, listed or not; of a later one, [`LATEST`] here does not know.
+    #[serde(default)]
+    pub newest: u32,
     /// Alias to version.
     pub aliases: BTreeMap<String, u32>,
     /// Versions taken out of listings.
@@ -48,6 +58,29 @@ pub struct ObjectState {
     /// Since when, where that is known.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub retired_at: BTreeMap<u32, DateTime<Utc>>,
+}
+
+impl ObjectState {
+    /// Whether this is what the records of `versions` say by themselves.
+    fn is_plain(&self) -> bool {
+        let named = self
+            .aliases
+            .iter()
+            .map(|(alias, version)| (alias.as_str(), *version));
+        self.retired.is_empty() && named.eq([(LATEST, self.newest)])
+    }
+
+    /// Brings it up to the versions that are recorded, in any order.
+    fn catch_up(&mut self, versions: &BTreeSet<u32>) {
+        let Some(newest) = versions.last().copied().filter(|it| *it > self.newest) else {
+            return;
+        };
+        self.newest = newest;
+        match versions.difference(&self.retired).last() {
+            Some(listed) => self.aliases.insert(LATEST.to_owned(), *listed),
+            None => self.aliases.remove(LATEST),
+        };
+    }
 }
 
 /// A version as the bucket has it.
@@ -64,7 +97,7 @@ pub struct Published {
 pub struct Rebuild {
     /// Sorted by object and version.
     pub versions: Vec<Published>,
-    /// Objects that have aliases or retired versions.
+    /// Of each object.
     pub states: BTreeMap<ObjectName, ObjectState>,
     /// Records that cannot be used, and why: `(path, reason)`.
     pub faults: Vec<(String, String)>,
@@ -90,9 +123,14 @@ impl Registry {
             Some(_) => self.set_aside(&path).await?,
             None => {}
         }
-        self.put(&path, bytes.into()).await?;
+        self.put_record(&path, bytes).await?;
         ign_faults::point("version.recorded");
         Ok(())
+    }
+
+    async fn put_record(&self, path: &Path, bytes: Bytes) -> Result<(), RegistryError> {
+        let written = self.records.put(path, bytes.into()).await;
+        written.map(drop).map_err(store_error("write", path))
     }
 
     /// The versions that the bucket records, by name alone: `(object and version, path)`.
@@ -115,7 +153,7 @@ impl Registry {
         Ok(found)
     }
 
-    /// Writes an object's aliases and retired versions, unless they are there already.
+    /// Writes an object's aliases and retired versions, unless the bucket says the same already.
     pub async fn put_state(
         &self,
         object: &ObjectName,
@@ -123,14 +161,11 @@ impl Registry {
     ) -> Result<(), RegistryError> {
         let path = self.version_path(object, "state.json");
         let bytes = to_json(&path, state)?;
-        if self
-            .read_small(&path)
-            .await?
-            .is_some_and(|present| present == bytes)
-        {
+        let present = self.read_small(&path).await?;
+        if present.map_or_else(|| state.is_plain(), |present| present == bytes) {
             return Ok(());
         }
-        self.put(&path, bytes.into()).await?;
+        self.put_record(&path, bytes).await?;
         ign_faults::point("state.recorded");
         Ok(())
     }
@@ -173,6 +208,17 @@ impl Registry {
         rebuild.versions.sort_by(|a, b| {
             (&a.record.object, a.record.version).cmp(&(&b.record.object, b.record.version))
         });
+        let mut numbers: BTreeMap<&ObjectName, BTreeSet<u32>> = BTreeMap::new();
+        for Published { record, .. } in &rebuild.versions {
+            numbers
+                .entry(&record.object)
+                .or_default()
+                .insert(record.version);
+        }
+        for (object, numbers) in numbers {
+            let state = rebuild.states.entry(object.clone()).or_default();
+            state.catch_up(&numbers);
+        }
         rebuild.faults.sort();
         Ok(rebuild)
     }

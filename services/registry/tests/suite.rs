@@ -1,7 +1,7 @@
 //! One suite for both stores: a folder and an S3 endpoint with signature checks.
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -366,12 +366,24 @@ async fn versions_are_written_once_and_rebuilt(fixture: Fixture) {
         registry.put_version(&other).await,
         Err(RegistryError::VersionTaken { .. })
     ));
-    let state = ObjectState {
+    let plain = ObjectState {
+        newest: 10,
         aliases: [("latest".to_owned(), 10)].into(),
+        ..ObjectState::default()
+    };
+    let rebuilt = registry.rebuild().await.unwrap();
+    assert_eq!(rebuilt.states, BTreeMap::from([(object(), plain.clone())]));
+    registry.put_state(&object(), &plain).await.unwrap();
+    let written = fixture.folder.join("versions/museum/vase/state.json");
+    assert!(!written.exists(), "the records say all that it says");
+    let state = ObjectState {
+        aliases: [("latest".to_owned(), 10), ("approved".to_owned(), 1)].into(),
         retired: [1].into(),
         retired_at: [(1, v1.created_at)].into(),
+        ..plain
     };
     registry.put_state(&object(), &state).await.unwrap();
+    assert!(written.exists());
 
     let rebuilt = Registry::open(&fixture.config)
         .await
@@ -384,8 +396,31 @@ async fn versions_are_written_once_and_rebuilt(fixture: Fixture) {
         file_count: 1,
     };
     assert_eq!(rebuilt.versions, [published(&v1), published(&v10)]);
-    assert_eq!(rebuilt.states, BTreeMap::from([(object(), state)]));
+    assert_eq!(rebuilt.states, BTreeMap::from([(object(), state.clone())]));
     assert_eq!(rebuilt.faults, []);
+
+    // `latest` was moved back, then came a version, then that was retired.
+    let moved = ObjectState {
+        aliases: [("latest".to_owned(), 1)].into(),
+        retired: BTreeSet::new(),
+        retired_at: BTreeMap::new(),
+        ..state
+    };
+    registry.put_state(&object(), &moved).await.unwrap();
+    let latest = async || {
+        let rebuilt = registry.rebuild().await.unwrap();
+        rebuilt.states[&object()].aliases["latest"]
+    };
+    assert_eq!(latest().await, 1);
+    registry.put_version(&record(13)).await.unwrap();
+    assert_eq!(latest().await, 13);
+    let retired = ObjectState {
+        newest: 12,
+        retired: [13].into(),
+        ..moved
+    };
+    registry.put_state(&object(), &retired).await.unwrap();
+    assert_eq!(latest().await, 10);
 
     let lost = VersionRecord {
         version: 11,

@@ -20,6 +20,7 @@ use serde_json::json;
 
 const MINUTE: Duration = Duration::from_mins(1);
 const AGENT: &str = "agent-1";
+const APPROVED: &str = "approved";
 /// Short, so that a killed worker's job goes on soon.
 const LEASE_SECS: f64 = 1.0;
 
@@ -97,6 +98,9 @@ fn cycle(cluster: &mut Cluster, number: u64, fault: &str, restart_postgres: bool
         again.id == job.id,
         "{fault}: a second job came of one submit"
     );
+    cluster.insist("name", &mut look, async |api| {
+        api.set_alias(&object, "v1", APPROVED).await
+    })?;
     // The last points come after the job has ended.
     let late = ["version.", "state.", "agent.completed"];
     if late.iter().any(|point| fault.starts_with(point)) {
@@ -157,12 +161,20 @@ fn every_fault_point_is_killed_at_and_nothing_is_lost_or_doubled() -> Result<()>
         versions.len(),
         objects.len()
     );
-    ensure!(versions.iter().all(|version| version.version == 1));
+    let approved = [APPROVED, "latest"];
+    ensure!(
+        versions
+            .iter()
+            .all(|it| it.version == 1 && it.aliases == approved)
+    );
     // The bucket follows by itself, and says the same, with every file there.
     let begun = Instant::now();
     let bucket = loop {
         let bucket = cluster.bucket()?;
-        if bucket.versions.len() as u64 == cycles {
+        let mut states = bucket.states.values();
+        if bucket.versions.len() as u64 == cycles
+            && states.all(|state| state.aliases.keys().eq(&approved))
+        {
             break bucket;
         }
         ensure!(begun.elapsed() < MINUTE, "the bucket stays behind");

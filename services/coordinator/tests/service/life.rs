@@ -604,6 +604,15 @@ async fn the_bucket_is_repaired_after_a_crash_between_commit_and_record() {
         .complete(&lease, "worker-1", &[("bundle.json", b"one")])
         .await
         .unwrap();
+    service
+        .bundles
+        .set_alias(v1::SetAliasRequest {
+            object: Some(object_ref("museum/vase")),
+            reference: "v1".to_owned(),
+            alias: "approved".to_owned(),
+        })
+        .await
+        .unwrap();
     let folder = service.folder.join("store/versions/museum/vase");
     let before: Vec<Vec<u8>> = ["v1.json", "state.json"]
         .map(|name| std::fs::read(folder.join(name)).unwrap())

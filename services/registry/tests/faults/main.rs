@@ -138,7 +138,8 @@ async fn publish_through_faults(seed: u64) -> u64 {
     };
     insist(|| registry.put_version(&record)).await;
     let state = ObjectState {
-        aliases: [("latest".to_owned(), 1)].into(),
+        newest: 1,
+        aliases: [("latest".to_owned(), 1), ("approved".to_owned(), 1)].into(),
         ..ObjectState::default()
     };
     insist(|| registry.put_state(&vase, &state)).await;

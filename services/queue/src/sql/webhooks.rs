@@ -8,7 +8,8 @@ use ign_proto::{Attempt, CollectionId};
 use sqlx::{QueryBuilder, Row};
 
 use super::super::{Connection, Db, LOCK, LOCK_FREE_ROWS, from_key, key, to_db};
-use super::{DbRow, SqlStore, optional_time, parse, small, sql, time};
+use super::rows::{optional_time, parse, small, sql, time};
+use super::{DbRow, SqlStore};
 use crate::changes::Change;
 use crate::check;
 use crate::state::Job;
