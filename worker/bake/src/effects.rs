@@ -4,15 +4,14 @@
 //! what they learn from.
 
 use ign_nets::effects::{PaperEffects, PointEffects};
-use ign_nets::losses;
 use ign_nets::optim::Trainee;
-use ign_nets::steps::{self, Descent, Observations, PointPairs, SiamesePair};
+use ign_nets::steps::{self, Descent, Observations, SiamesePair};
 use ign_nets::warp::Sources;
 use ign_nets::{Builder, Params};
-use ign_render::{RenderSettings, Target};
+use ign_render::{Effects, RenderSettings, Target};
 use rand::RngExt;
 use rayon::prelude::*;
-use tch::{Device, Kind, Tensor, no_grad};
+use tch::{Device, Kind, Tensor};
 
 use crate::BakeError;
 use crate::checkpoint::{Session, Stage, Watch};
@@ -25,13 +24,8 @@ const POINT_RATE: f64 = 2e-3;
 /// Surface observations kept at most; more views thin them out evenly.
 const MOST_OBSERVATIONS: usize = 4_000_000;
 
-/// Pairs with a validation view, which say how well effects predict what was not trained on.
-const UNSEEN_BATCHES: usize = 4;
-const UNSEEN_BATCH: i64 = 8192;
-const UNSEEN: &str = "effects_unseen";
-
 /// Name and length of one training.
-pub(crate) struct Plan {
+pub(crate) struct Plan<'a> {
     /// Stage in checkpoints.
     pub(crate) stage: &'static str,
     pub(crate) schedule: Schedule,
@@ -42,10 +36,12 @@ pub(crate) struct Plan {
     pub(crate) average_decay: f64,
     /// What layers of the point effects compute in.
     pub(crate) kind: Kind,
+    /// Error on the validation views with these effects; `None` when there are no such views.
+    pub(crate) validation: &'a dyn Fn(Effects) -> Option<f64>,
 }
 
-/// Every surface point that a training or validation view sees, those of the training views first, and how many these are.
-fn observe_all(data: &Dataset<'_>) -> Result<(Observations, i64), BakeError> {
+/// Every surface point that a training view sees.
+fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
     struct One {
         camera: ign_geometry::Camera,
         points: Vec<f32>,
@@ -56,8 +52,8 @@ fn observe_all(data: &Dataset<'_>) -> Result<(Observations, i64), BakeError> {
         alpha: Vec<u8>,
     }
     let per_view = MOST_OBSERVATIONS / data.train.len().max(1);
-    let all: Vec<usize> = data.train.iter().chain(&data.validation).copied().collect();
-    let views: Vec<One> = all
+    let views: Vec<One> = data
+        .train
         .par_iter()
         .map(|&view| {
             let straight = data.straight(view, data.reference_scale)?;
@@ -160,9 +156,7 @@ fn observe_all(data: &Dataset<'_>) -> Result<(Observations, i64), BakeError> {
             ))
         })
         .collect();
-    let trained = &views[..data.train.len()];
-    let trained_points = trained.iter().map(|v| v.points.len() as i64 / 3).sum();
-    let observations = Observations {
+    Ok(Observations {
         points: stack(|v| &v.points),
         normals: stack(|v| &v.normals),
         colors: stack(|v| &v.colors),
@@ -170,8 +164,7 @@ fn observe_all(data: &Dataset<'_>) -> Result<(Observations, i64), BakeError> {
         sources: Sources::new(&cameras, &depth, data.device),
         source_colors: Tensor::cat(&rgb, 0).to_device(data.device),
         source_alpha: Tensor::cat(&alpha, 0).to_device(data.device),
-    };
-    Ok((observations, trained_points))
+    })
 }
 
 /// Copies a row-major image of `channels` into the top-left corner of one of size `to`.
@@ -191,70 +184,41 @@ fn padded<T: Copy + Default>(from: &[T], width: u32, channels: usize, to: (u32, 
 pub(crate) fn train_points(
     data: &Dataset<'_>,
     session: &mut Session<'_>,
-    plan: &Plan,
+    plan: &Plan<'_>,
 ) -> Result<(), BakeError> {
     let (seed, batch) = (plan.seed, plan.batch);
     let before = session.reporter.activity("observations");
-    let (observations, trained_points) = observe_all(data)?;
-    let trained_views = data.train.len() as i64;
+    let observations = observe_all(data)?;
+    let points = observations.points.size()[0];
+    let views = data.train.len() as i64;
     session.reporter.activity(before);
     let mut builder = Builder::new();
     let net = PointEffects::new(&mut builder);
     let trainee = Trainee::new(builder.build(data.device, seed), plan.average_decay);
-    let unseen = unseen_pairs(&observations, (trained_points, trained_views), seed);
+    let validation = |params: &Params| {
+        let effects = Effects::Points(net.clone(), params.in_kind(Kind::Float));
+        (plan.validation)(effects)
+    };
     let stage = Stage {
         name: plan.stage,
         schedule: plan.schedule,
         watch: Some(Watch {
             keep_best: false,
-            validation: &|params| unseen_error(&unseen, &net, params),
+            validation: &validation,
             curve: None,
         }),
     };
     session.train(&stage, vec![trainee], |trainees, step, rate| {
         let trainee = &mut trainees[0];
         let mut rng = step_rng(seed, plan.stage, step);
-        let pick = indices(&mut rng, batch, trained_points, data.device);
-        let other = indices(&mut rng, batch, trained_views, data.device);
+        let pick = indices(&mut rng, batch, points, data.device);
+        let other = indices(&mut rng, batch, views, data.device);
         let descent = Descent {
             rate: POINT_RATE * rate,
             kind: plan.kind,
         };
         steps::point_step(&net, trainee, &observations, (&pick, &other), descent)
     })
-}
-
-/// Observations of validation views beside those of training views at the same points.
-fn unseen_pairs(
-    all: &Observations,
-    (trained_points, trained_views): (i64, i64),
-    seed: u64,
-) -> Vec<PointPairs> {
-    let unseen = all.points.size()[0] - trained_points;
-    if unseen == 0 {
-        return Vec::new();
-    }
-    let mut rng = step_rng(seed, UNSEEN, 0);
-    (0..UNSEEN_BATCHES)
-        .filter_map(|_| {
-            let device = all.points.device();
-            let pick = indices(&mut rng, UNSEEN_BATCH, unseen, device) + trained_points;
-            let other = indices(&mut rng, UNSEEN_BATCH, trained_views, device);
-            PointPairs::new(all, &pick, &other)
-        })
-        .collect()
-}
-
-/// Mean squared error, on [0, 255], of predicting validation views from training views and effects.
-fn unseen_error(unseen: &[PointPairs], net: &PointEffects, params: &Params) -> Option<f64> {
-    let errors = unseen.iter().map(|pairs| {
-        no_grad(|| {
-            let (here, there) = pairs.effects(net, params);
-            losses::pair_error(&pairs.with(&here, &there)).double_value(&[])
-        })
-    });
-    let sum: f64 = errors.sum();
-    (!unseen.is_empty()).then(|| sum / unseen.len() as f64 * 255.0 * 255.0)
 }
 
 /// Everything the paper's `EffectsNet` needs of one training view.
@@ -275,7 +239,7 @@ struct PaperView {
 pub(crate) fn train_paper(
     data: &Dataset<'_>,
     session: &mut Session<'_>,
-    plan: &Plan,
+    plan: &Plan<'_>,
     settings: &RenderSettings,
 ) -> Result<(), BakeError> {
     let views: Vec<PaperView> = data

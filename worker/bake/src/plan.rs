@@ -21,7 +21,7 @@ use crate::training::Drawn;
 /// Numbers of references that are tried, most first.
 const REFERENCES: [usize; 6] = [20, 14, 10, 7, 5, 4];
 /// Error that fewer references may add, as a share.
-const REFERENCE_SLACK: f64 = 0.02;
+const REFERENCE_SLACK: f64 = 0.005;
 /// Bytes of a bundle besides references, proxy and weights.
 const OTHER_BYTES: f64 = 1e5;
 /// Bytes of a proxy's vertex and triangle in a bundle.
@@ -80,7 +80,7 @@ pub(crate) fn fit(
     let enough = fewest_references(data, &mut drawn, session);
     if enough < chosen.len() {
         words.push(format!(
-            "{enough} of {} references suffice: more lower the error of plain blending by less than {:.0} %.",
+            "{enough} of {} references suffice: more lower the error of plain blending by less than {:.1} %.",
             chosen.len(),
             100.0 * REFERENCE_SLACK
         ));

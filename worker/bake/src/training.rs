@@ -2,7 +2,9 @@
 //!
 //! Two forms of each network: `EffectsNet` per surface point or as the paper's U-Net, `CompositionNet` with the blending
 //! head or as the paper's painter. `EffectsNet` is kept where it lowers the error of plain blending on validation views;
-//! with preset `auto`, `CompositionNet` too, and both train for as long as that pays.
+//! with preset `auto`, `CompositionNet` too, and both train for as long as they lower that error by enough.
+
+use std::cell::RefCell;
 
 use ign_bundle::metrics::SpeedError;
 use ign_nets::composition::{BlendComposition, PaperComposition};
@@ -231,6 +233,7 @@ impl Trainer<'_> {
                 budget_secs: self.budget_secs.map(|secs| secs * share),
                 rate: settings.rate(EFFECTS_KNEE, None),
             };
+            let watched = RefCell::new(Some(self.drawn.plain(data)));
             let plan = effects::Plan {
                 stage: names.effects,
                 schedule,
@@ -238,6 +241,12 @@ impl Trainer<'_> {
                 batch: settings.effects_batch,
                 average_decay: settings.average_decay,
                 kind: settings.kind(),
+                validation: &|effects| {
+                    let model = watched.take()?.with_effects(Some(effects));
+                    let errors = composition::prior_errors(&model, &self.drawn.validation);
+                    watched.replace(Some(model));
+                    errors.map(|(full, _)| full)
+                },
             };
             match settings.effects_net {
                 EffectsNet::Points => effects::train_points(data, session, &plan)?,

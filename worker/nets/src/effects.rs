@@ -49,7 +49,7 @@ const REFLECTION_OCTAVES: i64 = 4;
 const HIDDEN: i64 = 64;
 
 /// `EffectsNet` of preset `standard`: a perceptron per surface point, in linear light.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct PointEffects {
     layers: Vec<(ParamId, ParamId)>,
 }

@@ -38,20 +38,12 @@ pub struct Pair<'a> {
 /// channels of a robust (Charbonnier) difference of encoded colours. Light adds up in linear light; a clipped
 /// observation predicts nothing.
 pub fn pair(pair: &Pair<'_>) -> Tensor {
-    pair_mean(pair, |d| (d.square() + PAIR_TURN).sqrt())
-}
-
-/// The mean squared difference of the same predictions: the error that effects leave, on encoded colours in [0, 1].
-pub fn pair_error(pair: &Pair<'_>) -> Tensor {
-    pair_mean(pair, |d| d.square())
-}
-
-fn pair_mean(pair: &Pair<'_>, size: impl Fn(Tensor) -> Tensor) -> Tensor {
     let here = color::linear_from_srgb(pair.color_here) - pair.effects_here;
     let there = color::linear_from_srgb(pair.color_there) - pair.effects_there;
     let predicted_here = color::srgb_from_linear(&(there + pair.effects_here));
     let predicted_there = color::srgb_from_linear(&(here + pair.effects_there));
     let unclipped = |c: &Tensor| c.lt(CLIPPED).to_kind(c.kind());
+    let size = |d: Tensor| (d.square() + PAIR_TURN).sqrt();
     let error = size(predicted_here - pair.color_here) * unclipped(pair.color_there)
         + size(predicted_there - pair.color_there) * unclipped(pair.color_here);
     (error * pair.sound).sum(KEEP) / (pair.sound.sum(KEEP) * 6.0).clamp_min(1.0)

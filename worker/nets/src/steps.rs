@@ -176,8 +176,7 @@ pub struct Observations {
 }
 
 /// Surface points that two views each see, with what they saw: P points.
-#[derive(Debug)]
-pub struct PointPairs {
+struct PointPairs {
     /// [P, 3] each.
     points: Tensor,
     normals: Tensor,
@@ -191,7 +190,7 @@ pub struct PointPairs {
 
 impl PointPairs {
     /// What views `other` ([B] i64) see at the points of observations `pick` ([B] i64), where they do; `None` when none does.
-    pub fn new(all: &Observations, pick: &Tensor, other: &Tensor) -> Option<Self> {
+    fn new(all: &Observations, pick: &Tensor, other: &Tensor) -> Option<Self> {
         let points = all.points.index_select(0, pick);
         let normals = all.normals.index_select(0, pick);
         let taps = all.sources.taps(&points, &normals, other);
@@ -235,20 +234,9 @@ impl PointPairs {
     }
 
     /// Effects as seen from here and from there: [P, 3] each, linear light.
-    pub fn effects(&self, net: &PointEffects, params: &Params) -> (Tensor, Tensor) {
+    fn effects(&self, net: &PointEffects, params: &Params) -> (Tensor, Tensor) {
         let seen_from = |to_viewer| net.forward(params, &self.points, &self.normals, to_viewer);
         (seen_from(&self.to_here), seen_from(&self.to_there))
-    }
-
-    /// With the effects that [`Self::effects`] gives.
-    pub fn with<'a>(&'a self, here: &'a Tensor, there: &'a Tensor) -> losses::Pair<'a> {
-        losses::Pair {
-            color_here: &self.color_here,
-            color_there: &self.color_there,
-            effects_here: here,
-            effects_there: there,
-            sound: &self.sound,
-        }
     }
 }
 
@@ -279,7 +267,14 @@ pub fn point_step(
     };
     let (here, there) = pairs.effects(net, &trainee.params.in_kind(descent.kind));
     let size = losses::sparsity(&here) + losses::sparsity(&there);
-    let loss = losses::pair(&pairs.with(&here, &there)) + size * (0.5 * SPARSITY);
+    let pair = losses::Pair {
+        color_here: &pairs.color_here,
+        color_there: &pairs.color_there,
+        effects_here: &here,
+        effects_there: &there,
+        sound: &pairs.sound,
+    };
+    let loss = losses::pair(&pair) + size * (0.5 * SPARSITY);
     trainee.descend(&loss, descent.rate, MOST_GRADIENT);
     loss.double_value(&[])
 }
