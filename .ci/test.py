@@ -14,8 +14,8 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 NO_TORCH = ["-p", "ignctl", "-p", "ign-coordinator"]
@@ -108,24 +108,26 @@ def test_targets():
     return chosen(end_to_end), ["--lib", "--bins", *chosen(others)]
 
 
-def run_stream(prefix, commands, totals):
-    """Runs test commands one after the other; adds what passed and failed to `totals`."""
+def run_stream(prefix, commands):
+    """Runs test commands one after the other; passed and failed."""
     # Idle OpenMP threads of parallel tests would spin against each other.
     env = {"OMP_NUM_THREADS": "1", "RUST_LIB_BACKTRACE": "0", **os.environ}
+    passed = failed = 0
     for command in commands:
         say("$ " + " ".join(command))
-        failed = 0
+        failed_before = failed
         with subprocess.Popen(
             command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
         ) as tests:
             for line in tests.stdout:
                 print(prefix + line, end="", flush=True)
                 if result := RESULT.match(line):
-                    totals.append((int(result[1]), int(result[2])))
+                    passed += int(result[1])
                     failed += int(result[2])
         # A test binary that was killed prints no result.
-        if tests.returncode != 0 and failed == 0:
-            totals.append((0, 1))
+        if tests.returncode != 0 and failed == failed_before:
+            failed += 1
+    return passed, failed
 
 
 def run_tests():
@@ -136,14 +138,14 @@ def run_tests():
     end_to_end, others = test_targets()
     test = ["cargo", "test", "--locked", "--workspace", "--no-fail-fast"]
     # End-to-end tests wait for processes more than they compute: the others run beside them, and give way.
-    totals = []
     started = time.monotonic()
-    waiting = threading.Thread(target=run_stream, args=("e2e| ", [[*test, *end_to_end]], totals))
-    waiting.start()
-    run_stream("", [["nice", *test, *others], ["nice", *test, "--doc"]], totals)
-    waiting.join()
+    with ThreadPoolExecutor() as beside:
+        waiting = beside.submit(run_stream, "e2e| ", [[*test, *end_to_end]])
+        passed, failed = run_stream("", [["nice", *test, *others], ["nice", *test, "--doc"]])
+        # Raises what the other stream raised: none of its tests may be missed.
+        also_passed, also_failed = waiting.result()
     say(f"tests ended after {time.monotonic() - started:.0f} s")
-    return tuple(sum(column) for column in zip(*totals)) if totals else (0, 1)
+    return passed + also_passed, failed + also_failed
 
 
 def main():

@@ -17,7 +17,7 @@ use crate::BakeError;
 use crate::checkpoint::{Session, Stage, Watch};
 use crate::data::Dataset;
 use crate::sampler::{indices, step_rng};
-use crate::schedule::Schedule;
+use crate::schedule::{Rate, Schedule};
 
 /// Peak learning rate of the point effects (paper: 1e-3 constant for its U-Net).
 const POINT_RATE: f64 = 2e-3;
@@ -199,10 +199,12 @@ pub(crate) fn train_points(
         let effects = Effects::Points(net.clone(), params.in_kind(Kind::Float));
         (plan.validation)(effects)
     };
+    // Rendering the validation views costs as much as many steps: not where the end is known.
+    let ends_on_the_way = matches!(plan.schedule.rate, Rate::WhileItPays { .. });
     let stage = Stage {
         name: plan.stage,
         schedule: plan.schedule,
-        watch: Some(Watch {
+        watch: ends_on_the_way.then_some(Watch {
             keep_best: false,
             validation: &validation,
             curve: None,

@@ -233,7 +233,8 @@ impl Trainer<'_> {
                 budget_secs: self.budget_secs.map(|secs| secs * share),
                 rate: settings.rate(EFFECTS_KNEE, None),
             };
-            let watched = RefCell::new(Some(self.drawn.plain(data)));
+            // Made once, where it is asked for at all.
+            let watched = RefCell::new(None);
             let plan = effects::Plan {
                 stage: names.effects,
                 schedule,
@@ -242,7 +243,8 @@ impl Trainer<'_> {
                 average_decay: settings.average_decay,
                 kind: settings.kind(),
                 validation: &|effects| {
-                    let model = watched.take()?.with_effects(Some(effects));
+                    let model = watched.take().unwrap_or_else(|| self.drawn.plain(data));
+                    let model = model.with_effects(Some(effects));
                     let errors = composition::prior_errors(&model, &self.drawn.validation);
                     watched.replace(Some(model));
                     errors.map(|(full, _)| full)

@@ -70,9 +70,7 @@ impl SqlStore {
         transaction.commit().await.map_err(from_commit)?;
         Ok(draining)
     }
-}
 
-impl SqlStore {
     /// The next jobs for some workers, each as if it had asked alone, in their order.
     pub(super) async fn lease_all(&self, asks: &[LeaseAsk]) -> Result<Vec<Option<Job>>> {
         let mut reader = self.backend.reader().acquire().await?;
