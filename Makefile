@@ -7,10 +7,11 @@
 #   make setup                      libtorch into the per-user cache, linked as .libtorch
 #   make fuzz TARGET=name [SECS=60]  one parser under libFuzzer; needs cargo-fuzz, see tests/fuzz
 #   make ablation [CAPTURES="dir ..."] [ARGS="--seeds 1 --budget-secs 10"]  what each part of the recipe is worth
+#   make pretrain                   the weights that every CompositionNet starts from, on generated captures
 #   make bench [BENCH=name] [ARGS="--views 20 --rounds 1"]   speed beside a peer, one case or all; see tests/bench
 
 .POSIX:
-.PHONY: bake test lint bench ablation fuzz setup build
+.PHONY: bake test lint bench ablation pretrain fuzz setup build
 
 CARGO = cargo
 # One profile serves baking and testing: the numeric code is optimised in it, and nothing is compiled twice.
@@ -72,6 +73,19 @@ ablation: build
 		demo mirror '--shape sphere --gloss 1 --seed 2'; demo turntable '--shape bowl --gloss 0.6 --seed 3 --turntable'; \
 	fi; \
 	"$$bin/ign-worker" experiment ablation $$captures --out "$$out" --size 96 $(ARGS)
+
+# Seeds from 100 on are for this alone: no test and no demonstration uses them.
+pretrain: build
+	@set -eu; bin=$(BIN); out=bake-out/pretrain; seed=100; \
+	for gloss in 0 0.3 0.6 0.9; do for shape in vase bowl sphere; do \
+		seed=$$((seed + 1)); size=$$((96 + 96 * (seed % 2))); capture=$$out/$$shape-$$seed; \
+		if [ ! -e "$$capture/test.txt" ]; then \
+			rm -rf "$$capture"; mkdir -p "$$out"; \
+			"$$bin/ign-worker" demo-capture "$$capture" --shape "$$shape" --gloss "$$gloss" --seed "$$seed" --size "$$size" --views 64; \
+		fi; \
+	done; done; \
+	"$$bin/ign-worker" pretrain "$$out"/*-1* --out worker/bake/pretrained/composition.safetensors --size 96 \
+		--set effects_steps=300 --set composition_steps=6000 $(ARGS)
 
 bench:
 	python3 tests/bench/run.py $(BENCH) $(ARGS)

@@ -55,7 +55,8 @@ def install_postgres():
 
 
 def builds_without_torch():
-    """The tool and the coordinator name no torch crate and build where there is no libtorch."""
+    """The tool and the coordinator depend on no torch crate, so nothing of libtorch is asked for when they are built, and
+    what was built loads none."""
     tree = subprocess.run(
         ["cargo", "tree", "--locked", "--edges", "normal,build", "--prefix", "none", *NO_TORCH],
         cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False,
@@ -67,9 +68,6 @@ def builds_without_torch():
     if torch := crates & {"tch", "torch-sys", "ign-nets"}:
         say(f"error: ignctl or ign-coordinator depends on {', '.join(sorted(torch))}")
         return False
-    if not run("cargo", "check", "--locked", *NO_TORCH, env={"LIBTORCH": "/nonexistent", "LIBTORCH_USE_PYTORCH": "0"}):
-        return False
-    # What the tests have just linked loads no libtorch either.
     target = os.environ.get("CARGO_TARGET_DIR", "target")
     for name in ("ignctl", "ign-coordinator"):
         with open(os.path.join(ROOT, target, "debug", name), "rb") as program:

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, anyhow};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use ign_bake::experiment::{self, Experiment, ExperimentJob};
-use ign_bake::{Crop, Event, Preset, Recipe};
+use ign_bake::{BakeError, Crop, Event, Preset, Recipe};
 
 use crate::{gpu, output};
 
@@ -66,7 +66,7 @@ fn preset(name: &str) -> Result<Preset, String> {
         .map_err(|error| format!("expected auto, standard or paper: {error}"))
 }
 
-fn key_value(text: &str) -> Result<(String, String), String> {
+pub(crate) fn key_value(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {
         Some((key, value)) if !key.is_empty() => Ok((key.to_owned(), value.to_owned())),
         _ => Err("expected KEY=VALUE".to_owned()),
@@ -77,14 +77,7 @@ fn key_value(text: &str) -> Result<(String, String), String> {
 const INTERVAL: Duration = Duration::from_secs(10);
 
 pub(crate) fn run(options: &Options) -> Result<()> {
-    gpu::enable()?;
-    let threads = match options.threads {
-        Some(threads) => threads,
-        None => std::thread::available_parallelism()?,
-    };
-    rayon::ThreadPoolBuilder::new()
-        .num_threads(threads.get())
-        .build_global()?;
+    let threads = prepare(options.threads)?;
     let job = ExperimentJob {
         experiment: options.experiment,
         captures: options.captures.clone(),
@@ -104,30 +97,49 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         seeds: options.seeds,
         only: options.only.clone(),
         out: options.out.clone(),
-        threads: threads.get(),
+        threads,
     };
-    let said = Cell::new(Instant::now());
-    let files = experiment::run(&job, &|event| match event {
+    for file in experiment::run(&job, &said()).map_err(|error| explained(&error))? {
+        output::data(&file.display().to_string());
+    }
+    Ok(())
+}
+
+/// Says what a training reports, its progress now and then.
+pub(crate) fn said() -> impl Fn(Event) {
+    let last = Cell::new(Instant::now());
+    move |event| match event {
         Event::Log { message, .. } => output::say(&message),
-        Event::Progress(progress) if said.get().elapsed() >= INTERVAL => {
-            said.set(Instant::now());
+        Event::Progress(progress) if last.get().elapsed() >= INTERVAL => {
+            last.set(Instant::now());
             output::say(&format!(
                 "{:3.0} % {}: {}",
                 progress.percent, progress.stage, progress.message
             ));
         }
         _ => {}
-    });
-    let files = files.map_err(|error| {
-        let failure = error.failure();
-        let hint = match failure.hint.as_str() {
-            "" => String::new(),
-            hint => format!("\nhint: {hint}"),
-        };
-        anyhow!("{}{hint}", failure.message)
-    })?;
-    for file in files {
-        output::data(&file.display().to_string());
     }
-    Ok(())
+}
+
+/// A failure with what to do about it.
+pub(crate) fn explained(error: &BakeError) -> anyhow::Error {
+    let failure = error.failure();
+    let hint = match failure.hint.as_str() {
+        "" => String::new(),
+        hint => format!("\nhint: {hint}"),
+    };
+    anyhow!("{}{hint}", failure.message)
+}
+
+/// Brings up the device and the threads; how many these are.
+pub(crate) fn prepare(threads: Option<NonZero<usize>>) -> Result<usize> {
+    gpu::enable()?;
+    let threads = match threads {
+        Some(threads) => threads.get(),
+        None => std::thread::available_parallelism()?.get(),
+    };
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build_global()?;
+    Ok(threads)
 }

@@ -1,7 +1,7 @@
 //! The worker binary.
 //!
 //! `agent` takes jobs from a coordinator; it never touches torch. `exec` bakes one job in a process of its own,
-//! which may crash without harm. `render`, `demo-capture` and `experiment` are for people.
+//! which may crash without harm. `render`, `demo-capture`, `experiment` and `pretrain` are for people.
 //!
 //! Streams: data on stdout (events of `exec`, paths of written files), the rest on stderr. Exit codes: 0 done,
 //! 1 failed, 2 wrong usage.
@@ -12,6 +12,7 @@ mod exec;
 mod experiment;
 mod gpu;
 mod output;
+mod pretrain;
 mod render;
 
 use std::process::ExitCode;
@@ -38,6 +39,8 @@ enum Command {
     DemoCapture(demo::Options),
     /// Repeat one of the paper's experiments: bakes, and a table and a plot of what they found.
     Experiment(experiment::Options),
+    /// Train the weights that every CompositionNet starts from; `make pretrain` does it on generated captures.
+    Pretrain(pretrain::Options),
     /// Print a shell's completion script.
     Completions {
         /// The shell.
@@ -57,6 +60,7 @@ fn main() -> ExitCode {
         Command::Exec(options) => return exec::run(&options),
         Command::Render(options) => render::run(&options),
         Command::Experiment(options) => experiment::run(&options),
+        Command::Pretrain(options) => pretrain::run(&options),
         Command::DemoCapture(options) => demo::run(&options),
         Command::Completions { shell } => {
             let mut command = Cli::command();

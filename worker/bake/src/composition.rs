@@ -16,6 +16,7 @@
 use ign_nets::composition::{BlendComposition, BlendInput, PaperComposition};
 use ign_nets::losses;
 use ign_nets::optim::Trainee;
+use ign_nets::params::flat_values;
 use ign_nets::patchgan::PatchGan;
 use ign_nets::steps::{Descent, Gan, GanExample, RATE, blend_step};
 use ign_nets::{Builder, Params};
@@ -27,8 +28,9 @@ use tch::{Kind, Tensor, no_grad};
 use crate::BakeError;
 use crate::checkpoint::{Curve, Session, Stage, Watch};
 use crate::data::{Dataset, Scored, errors_255};
+use crate::pretrain;
 use crate::recipe::{Loss, Settings};
-use crate::sampler::step_rng;
+use crate::sampler::{StepRng, step_rng};
 use crate::schedule::Schedule;
 use crate::training::Drawn;
 use crate::views::ViewStore;
@@ -100,7 +102,7 @@ fn mean_errors<I>(views: &[Watched<'_, I>], image: impl Fn(&I) -> Tensor) -> Opt
 }
 
 /// Every training view that shows the object, cut to its bounds: input, truth, coverage times scored.
-fn examples(
+pub(crate) fn examples(
     data: &Dataset<'_>,
     session: &Session<'_>,
     model: &Model,
@@ -213,12 +215,10 @@ pub(crate) fn train_blend(
     settings: &Settings,
     drawn: &Drawn,
 ) -> Result<(), BakeError> {
-    let (batch, patch) = (settings.batch, settings.patch);
     let examples = examples(data, session, model, settings, &drawn.images)?;
     let mut builder = Builder::new();
-    let net = BlendComposition::new(&mut builder, drawn.settings.k);
-    let params = builder.build(data.device, plan.seed);
-    let trainee = Trainee::new(params, settings.average_decay);
+    let net = BlendComposition::new(&mut builder, drawn.settings.k, settings.width);
+    let mut params = builder.build(data.device, plan.seed);
     let validation = watched_blend(model, &drawn.validation);
     let held_out = watched_blend(model, &drawn.held_out);
     let errors = |params: &Params, views| {
@@ -226,6 +226,18 @@ pub(crate) fn train_blend(
             net.forward(params, &with_kind(input, Kind::Float))
         })
     };
+    if settings.pretrained {
+        let error = |params: &Params| errors(params, &validation).map(|(full, _)| full);
+        let (plain, plain_error) = (flat_values(params.flat()), error(&params));
+        if pretrain::fill(&mut params)?
+            && let (Some(plain_error), Some(learned_error)) = (plain_error, error(&params))
+        {
+            session.measured(&pretrain::measure(plan.stage), || learned_error);
+            if learned_error > plain_error {
+                params.restore(&plain)?;
+            }
+        }
+    }
     let stage = Stage {
         name: plan.stage,
         schedule: plan.schedule,
@@ -239,46 +251,59 @@ pub(crate) fn train_blend(
             }),
         }),
     };
+    let trainee = Trainee::new(params, settings.average_decay);
     session.train(&stage, vec![trainee], |trainees, step, rate| {
-        let trainee = &mut trainees[0];
         let mut rng = step_rng(plan.seed, plan.stage, step);
-        let picked: Vec<usize> = (0..batch)
-            .map(|_| rng.random_range(0..examples.len()))
-            .collect();
-        // Windows of a batch have one size: the smallest that all its views can give.
-        let (h, w) = picked.iter().fold((patch, patch), |(h, w), &view| {
-            let size = examples.size(view);
-            (h.min(size.0), w.min(size.1))
-        });
-        let from: Vec<(usize, i64, i64)> = picked
-            .into_iter()
-            .map(|view| {
-                let size = examples.size(view);
-                let y = rng.random_range(0..=size.0 - h);
-                (view, y, rng.random_range(0..=size.1 - w))
-            })
-            .collect();
-        let windows = examples.windows(&from, (h, w));
-        let channels = windows.size()[1];
-        let k = drawn.settings.k;
-        let mut input = BlendInput::of_planes(&windows.narrow(1, 0, channels - 4), k);
-        if settings.shuffle {
-            let mut order: Vec<i64> = (0..k as i64).collect();
-            order.shuffle(&mut rng);
-            input = input.reordered(&order);
-        }
-        let truth = windows.narrow(1, channels - 4, 3);
-        let coverage = windows.narrow(1, channels - 1, 1);
-        let loss = match settings.loss {
-            Loss::Mixed => losses::blend,
-            Loss::L1 => |image: &Tensor, truth: &Tensor, _: &Tensor| losses::l1(image, truth),
-        };
-        let descent = Descent {
-            rate: BLEND_RATE * rate,
-            kind: settings.kind(),
-        };
-        blend_step(&net, trainee, &input, (&truth, &coverage), loss, descent)
+        train_on_windows(&net, &mut trainees[0], &examples, settings, &mut rng, rate)
     })
+}
+
+/// A step on windows of several views, drawn at random; returns the loss before it.
+pub(crate) fn train_on_windows(
+    net: &BlendComposition,
+    trainee: &mut Trainee,
+    examples: &ViewStore,
+    settings: &Settings,
+    rng: &mut StepRng,
+    rate: f64,
+) -> f64 {
+    let picked: Vec<usize> = (0..settings.batch)
+        .map(|_| rng.random_range(0..examples.len()))
+        .collect();
+    // Windows of a batch have one size: the smallest that all its views can give.
+    let patch = settings.patch;
+    let (h, w) = picked.iter().fold((patch, patch), |(h, w), &view| {
+        let size = examples.size(view);
+        (h.min(size.0), w.min(size.1))
+    });
+    let from: Vec<(usize, i64, i64)> = picked
+        .into_iter()
+        .map(|view| {
+            let size = examples.size(view);
+            let y = rng.random_range(0..=size.0 - h);
+            (view, y, rng.random_range(0..=size.1 - w))
+        })
+        .collect();
+    let windows = examples.windows(&from, (h, w));
+    let channels = windows.size()[1];
+    let k = settings.k;
+    let mut input = BlendInput::of_planes(&windows.narrow(1, 0, channels - 4), k);
+    if settings.shuffle {
+        let mut order: Vec<i64> = (0..k as i64).collect();
+        order.shuffle(rng);
+        input = input.reordered(&order);
+    }
+    let truth = windows.narrow(1, channels - 4, 3);
+    let coverage = windows.narrow(1, channels - 1, 1);
+    let loss = match settings.loss {
+        Loss::Mixed => losses::blend,
+        Loss::L1 => |image: &Tensor, truth: &Tensor, _: &Tensor| losses::l1(image, truth),
+    };
+    let descent = Descent {
+        rate: BLEND_RATE * rate,
+        kind: settings.kind(),
+    };
+    blend_step(net, trainee, &input, (&truth, &coverage), loss, descent)
 }
 
 /// What a generator sees of a target.

@@ -18,6 +18,7 @@ pub mod experiment;
 pub mod fuzz;
 mod pack;
 mod plan;
+mod pretrain;
 mod progress;
 mod recipe;
 mod run;
@@ -28,6 +29,7 @@ mod views;
 
 pub use error::BakeError;
 pub(crate) use error::io;
+pub use pretrain::{PretrainJob, pretrain};
 pub use recipe::{Crop, Method, Preset, Recipe};
 pub use run::{BakeJob, bake};
 

@@ -27,6 +27,8 @@ const OTHER_BYTES: f64 = 1e5;
 /// Bytes of a proxy's vertex and triangle in a bundle.
 const VERTEX_BYTES: f64 = 28.0;
 const TRIANGLE_BYTES: f64 = 12.0;
+/// Channels of a `CompositionNet` that renders faster, where frames are to be fast.
+const NARROW: i64 = 16;
 /// Times that a frame is rendered to know how long it takes, after one that does not count.
 const TIMED_FRAMES: usize = 3;
 /// Observations of a training, as far as their time is set aside.
@@ -40,7 +42,8 @@ const SPARE_SECS: f64 = 5.0;
 struct Manner {
     k: usize,
     supersample: u32,
-    networks: bool,
+    /// Of `CompositionNet`; `None` without networks.
+    width: Option<i64>,
 }
 
 /// What was decided.
@@ -117,7 +120,7 @@ pub(crate) fn training_secs(
     let manner = Manner {
         k: settings.k,
         supersample: data.settings.supersample,
-        networks: settings.compose,
+        width: settings.compose.then_some(settings.width),
     };
     let frame = frame_secs(data, drawn, manner);
     let pixels = |size: usize| (size * size) as f64;
@@ -170,33 +173,19 @@ fn fit_speed(
     fps: f64,
 ) -> String {
     let (k, supersample) = (settings.k, data.settings.supersample);
-    let fewer = k.min(2);
+    let (fewer, width) = (k.min(2), settings.width);
+    let manner = |k, supersample, width| Manner {
+        k,
+        supersample,
+        width,
+    };
     let mut manners = vec![
-        Manner {
-            k,
-            supersample,
-            networks: true,
-        },
-        Manner {
-            k,
-            supersample: 1,
-            networks: true,
-        },
-        Manner {
-            k: fewer,
-            supersample: 1,
-            networks: true,
-        },
-        Manner {
-            k,
-            supersample: 1,
-            networks: false,
-        },
-        Manner {
-            k: fewer,
-            supersample: 1,
-            networks: false,
-        },
+        manner(k, supersample, Some(width)),
+        manner(k, 1, Some(width)),
+        manner(k, 1, Some(width.min(NARROW))),
+        manner(fewer, 1, Some(width.min(NARROW))),
+        manner(k, 1, None),
+        manner(fewer, 1, None),
     ];
     manners.dedup();
     let timed: Vec<(Manner, f64)> = manners
@@ -205,9 +194,9 @@ fn fit_speed(
             let Manner {
                 k,
                 supersample,
-                networks,
+                width,
             } = manner;
-            let name = format!("fps_k{k}_samples{supersample}_networks_{networks}");
+            let name = format!("fps_k{k}_samples{supersample}_width{}", width.unwrap_or(0));
             let rate = || 1.0 / frame_secs(data, drawn, manner).max(1e-6);
             (manner, session.measured(&name, rate))
         })
@@ -217,12 +206,13 @@ fn fit_speed(
         return String::new();
     };
     settings.k = manner.k;
-    settings.compose = manner.networks;
+    settings.compose = manner.width.is_some();
+    settings.width = manner.width.unwrap_or(settings.width);
     data.settings.k = manner.k;
     data.settings.supersample = manner.supersample;
     format!(
-        "At least {fps} frames a second are asked for: {} {} views a pixel, {} samples a pixel side, {} networks; {reached:.1} \
-         frames a second on this device.",
+        "At least {fps} frames a second are asked for: {} {} views a pixel, {} samples a pixel side, {} networks; \
+         {reached:.1} frames a second on this device.",
         if reached >= fps {
             "reached with"
         } else {
@@ -230,7 +220,9 @@ fn fit_speed(
         },
         manner.k,
         manner.supersample,
-        if manner.networks { "with" } else { "without" },
+        manner
+            .width
+            .map_or("no".into(), |width| format!("{width} channels wide")),
     )
 }
 
@@ -243,12 +235,12 @@ fn frame_secs(data: &Dataset<'_>, drawn: &Drawn, manner: Manner) -> f64 {
     (render.k, render.supersample) = (manner.k, manner.supersample);
     let mut model = drawn.plain(data);
     model.settings = render.clone();
-    if manner.networks {
+    if let Some(width) = manner.width {
         let mut builder = Builder::new();
         let net = PointEffects::new(&mut builder);
         model = model.with_effects(Some(Effects::Points(net, builder.build(data.device, 0))));
         let mut builder = Builder::new();
-        let net = BlendComposition::new(&mut builder, manner.k);
+        let net = BlendComposition::new(&mut builder, manner.k, width);
         model.composition = Some(Composition::Blend(net, builder.build(data.device, 0)));
     }
     let mut times: Vec<f64> = (0..=TIMED_FRAMES)
@@ -276,7 +268,7 @@ fn fit_bytes(
     settings.half_weights = true;
     let proxy = data.mesh.positions.len() as f64 * VERTEX_BYTES
         + data.mesh.triangles.len() as f64 * TRIANGLE_BYTES;
-    let rest = proxy + 2.0 * network_values(settings.k) as f64 + OTHER_BYTES;
+    let rest = proxy + 2.0 * network_values(settings.k, settings.width) as f64 + OTHER_BYTES;
     let mut least = f64::INFINITY;
     for scale in [data.reference_scale, 1] {
         if scale != data.reference_scale {
@@ -312,10 +304,10 @@ fn fit_bytes(
 }
 
 /// Numbers in the weights of both networks.
-fn network_values(k: usize) -> i64 {
+fn network_values(k: usize, width: i64) -> i64 {
     let mut builder = Builder::new();
     PointEffects::new(&mut builder);
-    BlendComposition::new(&mut builder, k);
+    BlendComposition::new(&mut builder, k, width);
     builder.values()
 }
 

@@ -1,5 +1,6 @@
 //! The recipe: what a job asks for. Submitted as JSON, stored in the bundle as submitted.
 
+use ign_nets::composition::{BLEND_WIDTH, BLEND_WIDTHS};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use tch::Kind;
@@ -246,6 +247,10 @@ pub(crate) struct Settings {
     /// Observations per step of the point effects.
     pub(crate) effects_batch: i64,
     pub(crate) composition_steps: u64,
+    /// Whether the blending head starts from weights that learned on other captures.
+    pub(crate) pretrained: bool,
+    /// Channels of the blending head at full resolution.
+    pub(crate) width: i64,
     /// Windows per step and their side in pixels.
     pub(crate) batch: usize,
     pub(crate) patch: i64,
@@ -328,6 +333,8 @@ impl Recipe {
             effects_steps: if paper { epochs(64) } else { 2000 },
             effects_batch: 8192,
             composition_steps: if paper { epochs(64) } else { 1000 },
+            pretrained: true,
+            width: BLEND_WIDTH,
             batch: 4,
             patch: 64,
             methods: Method::CHEAP.to_vec(),
@@ -471,6 +478,18 @@ impl Settings {
             "effects_steps" => self.effects_steps = number(key, value, 1, 10_000_000)?,
             "effects_batch" => self.effects_batch = number(key, value, 64, 1 << 20)?,
             "composition_steps" => self.composition_steps = number(key, value, 1, 10_000_000)?,
+            "start" => {
+                self.pretrained = choice(key, value, &[("pretrained", true), ("plain", false)])?;
+            }
+            "width" => {
+                self.width = number(key, value, *BLEND_WIDTHS.start(), *BLEND_WIDTHS.end())?;
+                if self.width % 2 != 0 {
+                    return Err(invalid(
+                        format!("setting width={value} is odd"),
+                        "use an even number",
+                    ));
+                }
+            }
             "batch" => self.batch = number(key, value, 1, 256)?,
             "patch" => self.patch = number(key, value, 16, 4096)?,
             "methods" => self.methods = methods(value)?,
@@ -486,7 +505,7 @@ impl Settings {
                     format!("setting {key} is unknown"),
                     "known: k, train_views, references, supersample, drawing, effects, effects_net, head, loss, leave_out, shuffle, precision, adversarial, \
                      average_decay, rate, effects_steps, effects_batch, composition_steps, \
-                     batch, patch, methods, half_weights, cache_mb, checkpoint_secs, margin, gains, fit, simplify, preview_frames, quality, \
+                     start, width, batch, patch, methods, half_weights, cache_mb, checkpoint_secs, margin, gains, fit, simplify, preview_frames, quality, \
                      target_psnr, max_secs, max_bundle_mb, min_render_fps",
                 ));
             }
@@ -581,6 +600,8 @@ mod tests {
             ("effects", "maybe"),
             ("gains", "on"),
             ("margin", "NaN"),
+            ("width", "2"),
+            ("width", "17"),
             ("methods", "ibr,texure"),
             ("methods", ""),
         ] {

@@ -16,6 +16,7 @@ use serde_json::json;
 use crate::checkpoint::Session;
 use crate::composition::{self, GeneratorInput, Plan, Views};
 use crate::data::{Dataset, Scored};
+use crate::pretrain;
 use crate::recipe::{EffectsChoice, EffectsNet, Head, Preset, Settings};
 use crate::schedule::Schedule;
 use crate::{BakeError, effects};
@@ -31,7 +32,7 @@ const PAPER_EFFECTS_SHARE: f64 = 0.3;
 
 /// Steps from which on learning rates fall.
 const EFFECTS_KNEE: f64 = 500.0;
-const COMPOSITION_KNEE: f64 = 50.0;
+pub(crate) const COMPOSITION_KNEE: f64 = 50.0;
 
 /// What one training is called: its row of metrics.json, and its stages in checkpoints.
 #[derive(Clone, Copy, Debug)]
@@ -191,6 +192,17 @@ impl Trainer<'_> {
         Ok((Trained { model, secs }, effects, composition))
     }
 
+    /// A model with effects where they pay, and no more.
+    pub(crate) fn effects_model(
+        &self,
+        session: &mut Session<'_>,
+        names: Names,
+    ) -> Result<Model, BakeError> {
+        let plain = self.drawn.plain(self.data);
+        let (model, _) = self.with_effects(session, plain, names, 1.0)?;
+        Ok(model)
+    }
+
     /// Error of plain blending with the model's effects on the validation views; measured once.
     fn blending_error(&self, session: &mut Session<'_>, name: &str, model: &Model) -> f64 {
         session.measured(name, || {
@@ -339,8 +351,15 @@ impl Trainer<'_> {
         });
         let gain = 1.0 - mse / prior_mse.max(1e-9);
         let kept = settings.preset != Preset::Auto || gain >= COMPOSITION_GAIN;
+        let start = session
+            .measurements()
+            .get(&pretrain::measure(names.composition))
+            .filter(|start| **start < prior_mse)
+            .map_or(String::new(), |start| {
+                format!(" ({start:.2} with what it had learned on other objects)")
+            });
         let taken = format!(
-            "CompositionNet takes the error of blending on validation views from {prior_mse:.2} to {mse:.2}"
+            "CompositionNet takes the error of blending on validation views from {prior_mse:.2}{start} to {mse:.2}"
         );
         let words = if kept {
             format!("{taken}.")
@@ -366,9 +385,9 @@ impl Trainer<'_> {
         if !session.finished(plan.stage) {
             composition::train_blend(self.data, session, model, plan, self.settings, self.drawn)?;
         }
-        let k = self.drawn.settings.k;
+        let (k, width) = (self.drawn.settings.k, self.settings.width);
         let (net, params) = session.restore(plan.stage, self.data.device, |b| {
-            BlendComposition::new(b, k)
+            BlendComposition::new(b, k, width)
         })?;
         Ok(Composition::Blend(net, params))
     }

@@ -144,7 +144,7 @@ fn header(input: &ReportInput<'_>, verdict: &Verdict) -> String {
                     &format!("{} ms", significant(ours.render_ms)),
                     "to render a frame",
                 ),
-                figure_card(&bytes(ours.bundle_bytes), "bundle"),
+                figure_card(&bytes(ours.bundle_bytes), "downloaded by a viewer"),
             ]
             .concat()
         });
@@ -266,7 +266,7 @@ fn methods_section(metrics: &Metrics) -> String {
         "<section><h2>Methods</h2><p class=\"note\">Means over {} held-out views of {width} × {height} pixels, 8-bit sRGB. \
          All methods share reference views, warping, coverage and compositing.</p><div class=\"scroll\"><table><thead><tr>\
          <th>method</th><th>MSE</th><th>MSE object</th><th>PSNR</th><th>PSNR object</th><th>SSIM</th><th>FLIP</th>\
-         <th>worst view</th><th>training</th><th>ms / frame</th><th>size</th></tr></thead><tbody>{rows}</tbody></table></div>\
+         <th>worst view</th><th>training</th><th>ms / frame</th><th>download</th></tr></thead><tbody>{rows}</tbody></table></div>\
          </section>",
         metrics.views.held_out
     )

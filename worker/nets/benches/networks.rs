@@ -8,7 +8,9 @@ use std::time::Instant;
 
 use glam::DVec3;
 use ign_geometry::{Camera, CameraIntrinsics};
-use ign_nets::composition::{BlendComposition, BlendInput, PaperComposition, TARGET_CHANNELS};
+use ign_nets::composition::{
+    BLEND_WIDTH, BlendComposition, BlendInput, PaperComposition, TARGET_CHANNELS,
+};
 use ign_nets::effects::{GEOMETRY_CHANNELS, PaperEffects, PointEffects};
 use ign_nets::losses;
 use ign_nets::optim::Trainee;
@@ -228,7 +230,7 @@ fn render_point_effects(inputs: &mut Inputs) -> Work {
 }
 
 fn train_blend(inputs: &mut Inputs) -> Work {
-    let (net, params) = inputs.network(|b| BlendComposition::new(b, K));
+    let (net, params) = inputs.network(|b| BlendComposition::new(b, K, BLEND_WIDTH));
     let input = blend_input(inputs, WINDOWS, WINDOW_PX);
     let image = |channels| [WINDOWS, channels, WINDOW_PX, WINDOW_PX];
     let truth = inputs.uniform("truth", &image(3), 0.0, 1.0);
@@ -247,7 +249,7 @@ fn train_blend(inputs: &mut Inputs) -> Work {
 }
 
 fn render_blend(inputs: &mut Inputs) -> Work {
-    let (net, params) = inputs.network(|b| BlendComposition::new(b, K));
+    let (net, params) = inputs.network(|b| BlendComposition::new(b, K, BLEND_WIDTH));
     let input = blend_input(inputs, 1, FRAME_PX);
     render(move || net.forward(&params, &input))
 }

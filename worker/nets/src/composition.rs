@@ -130,14 +130,19 @@ pub struct BlendComposition {
     head: Conv,
 }
 
-/// Channels per resolution level of [`BlendComposition`], full resolution first.
-pub const BLEND_WIDTHS: [i64; 4] = [32, 48, 64, 96];
+/// Channels of [`BlendComposition`] at full resolution; the levels below have 1.5, 2 and 3 times as many.
+pub const BLEND_WIDTH: i64 = 32;
+/// What [`BLEND_WIDTH`] may be: even, or the levels below have no whole number.
+pub const BLEND_WIDTHS: std::ops::RangeInclusive<i64> = 4..=128;
 
 impl BlendComposition {
-    /// Registers the network's tensors for `k` candidates.
-    pub fn new(builder: &mut Builder, k: usize) -> Self {
+    /// The weight from whose shape, [`width`, ., 3, 3], the width is known.
+    pub const STEM: &str = "composition.stem.weight";
+
+    /// Registers the network's tensors for `k` candidates; `width` is even.
+    pub fn new(builder: &mut Builder, k: usize, width: i64) -> Self {
         let k = k as i64;
-        let w = BLEND_WIDTHS;
+        let w = [width, width * 3 / 2, width * 2, width * 3];
         builder.scope("composition", |b| {
             let stem = Conv::new(b, "stem", (5 * k + 3 + TARGET_CHANNELS, w[0]), (3, 1, 1));
             let down = (1..w.len())
@@ -159,7 +164,10 @@ impl BlendComposition {
                     )
                 })
                 .collect();
-            let head = Conv::with_init(b, "head", (w[0], k + 4), (3, 1, 1), Init::Constant(0.0));
+            // Its logits decide between views: a rounding to bfloat16 shows.
+            let head = b.exact(|b| {
+                Conv::with_init(b, "head", (w[0], k + 4), (3, 1, 1), Init::Constant(0.0))
+            });
             Self {
                 k,
                 stem,

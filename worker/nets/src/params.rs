@@ -66,6 +66,8 @@ struct Slot {
     init: Init,
     offset: i64,
     trainable: bool,
+    /// Whether it stays in single precision whatever the layers compute in.
+    exact: bool,
 }
 
 impl Slot {
@@ -80,6 +82,7 @@ pub struct Builder {
     slots: Vec<Slot>,
     prefix: Vec<String>,
     next: i64,
+    exact: bool,
 }
 
 impl Builder {
@@ -98,6 +101,14 @@ impl Builder {
         self.prefix.push(name.to_owned());
         let value = body(self);
         self.prefix.pop();
+        value
+    }
+
+    /// Tensors registered inside `body` stay in single precision, also where [`Params::in_kind`] casts the others.
+    pub fn exact<T>(&mut self, body: impl FnOnce(&mut Self) -> T) -> T {
+        let outside = std::mem::replace(&mut self.exact, true);
+        let value = body(self);
+        self.exact = outside;
         value
     }
 
@@ -123,6 +134,7 @@ impl Builder {
             init,
             offset: self.next,
             trainable,
+            exact: self.exact,
         };
         self.next += slot.len();
         self.slots.push(slot);
@@ -184,14 +196,22 @@ impl Params {
         &self.leaves[id.0]
     }
 
-    /// The same network computing in `kind`: its tensors are casts of these, which gradients go back through.
+    /// The same network computing in `kind`: its tensors are casts of these, which gradients go back through, but for
+    /// those that stay [exact](Builder::exact).
     #[must_use]
     pub fn in_kind(&self, kind: Kind) -> Self {
+        let cast = |(slot, leaf): (&Slot, &Tensor)| {
+            if slot.exact {
+                leaf.shallow_clone()
+            } else {
+                leaf.to_kind(kind)
+            }
+        };
         Self {
             slots: self.slots.clone(),
             flat: self.flat.shallow_clone(),
             trained: self.trained.shallow_clone(),
-            leaves: self.leaves.iter().map(|leaf| leaf.to_kind(kind)).collect(),
+            leaves: self.slots.iter().zip(&self.leaves).map(cast).collect(),
         }
     }
 

@@ -104,10 +104,11 @@ impl Conv {
         })
     }
 
-    /// x: [B, input, H, W] -> [B, output, H', W'].
+    /// x: [B, input, H, W] -> [B, output, H', W'], in the kind of the layer's weights.
     pub fn forward(&self, params: &Params, x: &Tensor) -> Tensor {
-        x.conv2d(
-            params.get(self.weight),
+        let weight = params.get(self.weight);
+        x.to_kind(weight.kind()).conv2d(
+            weight,
             Some(params.get(self.bias)),
             [self.stride, self.stride],
             [self.padding, self.padding],

@@ -274,7 +274,7 @@ fn of_the_networks() {
     });
 
     let mut builder = Builder::new();
-    let blend = BlendComposition::new(&mut builder, 3);
+    let blend = BlendComposition::new(&mut builder, 3, 8);
     let params = builder.build(Device::Cpu, 4);
     // The head starts at zero, behind which nothing would have a gradient.
     no_grad(|| {

@@ -1,7 +1,9 @@
 //! What the networks promise: the paper's sizes, a start at plain blending, no dependence on framing, finite output.
 
 use ign_nets::Builder;
-use ign_nets::composition::{BlendComposition, BlendInput, PaperComposition, TARGET_CHANNELS};
+use ign_nets::composition::{
+    BLEND_WIDTH, BlendComposition, BlendInput, PaperComposition, TARGET_CHANNELS,
+};
 use ign_nets::effects::{PaperEffects, PointEffects};
 use ign_nets::patchgan::PatchGan;
 use tch::{Device, Kind, Tensor, no_grad};
@@ -62,7 +64,7 @@ fn blend_input(size: i64, k: i64) -> BlendInput {
 fn blending_starts_at_plain_blending() {
     let input = blend_input(64, 4);
     let mut builder = Builder::new();
-    let net = BlendComposition::new(&mut builder, 4);
+    let net = BlendComposition::new(&mut builder, 4, BLEND_WIDTH);
     let params = builder.build(Device::Cpu, 11);
     let out = no_grad(|| net.forward(&params, &input));
     let difference = (out - input.prior_blend()).abs().max().double_value(&[]);
@@ -84,7 +86,7 @@ fn shake(params: &ign_nets::Params) {
 fn a_crop_and_the_full_frame_agree() {
     let input = blend_input(320, 4);
     let mut builder = Builder::new();
-    let net = BlendComposition::new(&mut builder, 4);
+    let net = BlendComposition::new(&mut builder, 4, BLEND_WIDTH);
     let params = builder.build(Device::Cpu, 11);
     shake(&params);
     // Offsets that the strides divide; the network sees about 60 pixels far.
@@ -109,7 +111,7 @@ fn nothing_visible_gives_a_finite_image() {
     input.prior = input.prior.zeros_like();
     input.candidates = input.candidates.zeros_like();
     let mut builder = Builder::new();
-    let net = BlendComposition::new(&mut builder, 4);
+    let net = BlendComposition::new(&mut builder, 4, BLEND_WIDTH);
     let params = builder.build(Device::Cpu, 2);
     shake(&params);
     let out = net.forward(&params, &input);

@@ -10,7 +10,7 @@ use glam::DVec3;
 use ign_bundle::manifest::{Layer, NetworkInput};
 use ign_bundle::{Bundle, BundleError, NetworkDescription, Precision, Tensors};
 use ign_geometry::{Camera, CameraIntrinsics, Drawable, Similarity};
-use ign_nets::composition::{BlendComposition, PaperComposition};
+use ign_nets::composition::{BLEND_WIDTH, BLEND_WIDTHS, BlendComposition, PaperComposition};
 use ign_nets::effects::{PaperEffects, PointEffects};
 use ign_nets::{Builder, NetError, Params};
 use image::RgbImage;
@@ -351,20 +351,15 @@ fn load_effects(
     device: Device,
 ) -> Result<Effects, RenderError> {
     let mut builder = Builder::new();
+    let tensors = bundle.weights(network)?;
     match network.kind.as_str() {
         PAPER_EFFECTS => {
             let net = PaperEffects::new(&mut builder);
-            Ok(Effects::Paper(
-                net,
-                filled(builder, bundle, network, device)?,
-            ))
+            Ok(Effects::Paper(net, filled(builder, &tensors, device)?))
         }
         POINT_EFFECTS => {
             let net = PointEffects::new(&mut builder);
-            Ok(Effects::Points(
-                net,
-                filled(builder, bundle, network, device)?,
-            ))
+            Ok(Effects::Points(net, filled(builder, &tensors, device)?))
         }
         kind => Err(RenderError::UnknownNetwork { kind: kind.into() }),
     }
@@ -377,32 +372,29 @@ fn load_composition(
     device: Device,
 ) -> Result<Composition, RenderError> {
     let mut builder = Builder::new();
+    let tensors = bundle.weights(network)?;
     match network.kind.as_str() {
         PAPER_COMPOSITION => {
             let net = PaperComposition::new(&mut builder, PaperComposition::input_channels(k));
-            Ok(Composition::Paper(
-                net,
-                filled(builder, bundle, network, device)?,
-            ))
+            Ok(Composition::Paper(net, filled(builder, &tensors, device)?))
         }
         BLEND_COMPOSITION => {
-            let net = BlendComposition::new(&mut builder, k);
-            Ok(Composition::Blend(
-                net,
-                filled(builder, bundle, network, device)?,
-            ))
+            let net = BlendComposition::new(&mut builder, k, blend_width(&tensors));
+            Ok(Composition::Blend(net, filled(builder, &tensors, device)?))
         }
         kind => Err(RenderError::UnknownNetwork { kind: kind.into() }),
     }
 }
 
-fn filled(
-    builder: Builder,
-    bundle: &Bundle,
-    network: &NetworkDescription,
-    device: Device,
-) -> Result<Params, RenderError> {
-    let tensors = bundle.weights(network)?;
+/// Where it cannot be told from the weights, they do not fit, which [`filled`] says.
+fn blend_width(tensors: &Tensors) -> i64 {
+    let stem = tensors.get(BlendComposition::STEM);
+    stem.and_then(|stem| i64::try_from(*stem.shape.first()?).ok())
+        .filter(|width| BLEND_WIDTHS.contains(width))
+        .unwrap_or(BLEND_WIDTH)
+}
+
+fn filled(builder: Builder, tensors: &Tensors, device: Device) -> Result<Params, RenderError> {
     let shapes: std::collections::BTreeMap<&str, Vec<i64>> = tensors
         .iter()
         .map(|(name, t)| (name.as_str(), t.shape.iter().map(|&n| n as i64).collect()))

@@ -3,7 +3,7 @@
 
 use ign_geometry::{Camera, Drawable, Mesh};
 use ign_nets::Builder;
-use ign_nets::composition::{BlendComposition, PaperComposition};
+use ign_nets::composition::{BLEND_WIDTH, BlendComposition, PaperComposition};
 use ign_nets::effects::{PaperEffects, PointEffects};
 use ign_render::{
     ColorGrid, Composition, Effects, Model, Recipe, ReferenceImage, References, RenderSettings,
@@ -72,7 +72,7 @@ fn model(mesh: &Mesh, images: &[ReferenceImage], recipe: Recipe) -> Model {
         }
         Recipe::Standard => {
             let effects = PointEffects::new(&mut first);
-            let net = BlendComposition::new(&mut second, settings.k);
+            let net = BlendComposition::new(&mut second, settings.k, BLEND_WIDTH);
             let params = second.build(Device::Cpu, 2);
             no_grad(|| {
                 let noise = params.flat().randn_like() * 0.05;

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use ign_geometry::{Camera, Drawable, Mesh};
 use ign_nets::Builder;
-use ign_nets::composition::{BlendComposition, PaperComposition};
+use ign_nets::composition::{BLEND_WIDTH, BlendComposition, PaperComposition};
 use ign_nets::effects::PointEffects;
 use ign_nets::params::flat_values;
 use ign_render::{
@@ -302,7 +302,7 @@ fn a_window_shows_what_the_full_frame_shows() {
     };
     let (mut first, mut second) = (Builder::new(), Builder::new());
     let effects = PointEffects::new(&mut first);
-    let net = BlendComposition::new(&mut second, settings.k);
+    let net = BlendComposition::new(&mut second, settings.k, BLEND_WIDTH);
     let model = Model::new(
         references(&mesh, Recipe::Standard, |_, at, c| hard::pattern(at, c)),
         settings.clone(),

@@ -33,7 +33,7 @@ const fn change(
     }
 }
 
-const CHANGES: [Change; 13] = [
+const CHANGES: [Change; 14] = [
     change("effects per surface point", "effects_net", "unet", "points"),
     change("effects only where they pay", "effects", "on", "auto"),
     change("blending head", "head", "paint", "blend"),
@@ -45,6 +45,12 @@ const CHANGES: [Change; 13] = [
         "on",
     ),
     change("views in random order", "shuffle", "off", "on"),
+    change(
+        "weights learned on other objects",
+        "start",
+        "plain",
+        "pretrained",
+    ),
     change("falling learning rate", "rate", "constant", "falling"),
     change("average of weights", "average_decay", "0", "0.995"),
     change("2 x 2 samples a pixel", "supersample", "1", "2"),

@@ -94,6 +94,11 @@ fn standard_is_never_worse_than_plain_blending() {
             curve.iter().all(|(_, mse)| *mse <= NOISE * start),
             "{name}: {curve:?}"
         );
+        let measured = &bundle.manifest().plan["measured"];
+        let figure = |key: &str| measured[key].as_f64().expect("a figure");
+        // What was learned on other objects blends better than the plain weights here, before any training.
+        let (learned, plain) = (figure("composition_pretrained_mse"), figure("prior_mse"));
+        assert!(learned < plain, "{name}: {measured}");
         // The start is the mean of the same views as n_ibr, weighted.
         let plain = metrics.method("n_ibr").expect("a row").mse;
         assert!(start < 1.1 * plain, "{name}: {start}, n_ibr {plain}");
@@ -112,6 +117,7 @@ fn a_bundle_renders_what_was_scored() {
     for (name, preset, scale) in [
         ("standard", "standard", "fp32"),
         ("half", "standard", "fp16"),
+        ("wide", "standard", "fp32"),
         ("paper", "paper", "fp32"),
     ] {
         let mut recipe = recipe(&[("effects", "on")]);
@@ -119,6 +125,10 @@ fn a_bundle_renders_what_was_scored() {
         recipe
             .settings
             .insert("half_weights".into(), (scale == "fp16").to_string());
+        if name == "wide" {
+            // The width is known from the weights alone.
+            recipe.settings.insert("width".into(), "24".into());
+        }
         let folder = bake(&job(&capture, &dir.path().join(name), recipe), &|_| {}).expect("a bake");
         let bundle = Bundle::open(&folder).expect("it verifies");
         let metrics = bundle.metrics().expect("metrics").expect("metrics.json");
