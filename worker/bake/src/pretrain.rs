@@ -122,7 +122,7 @@ pub fn pretrain(job: &PretrainJob, events: &dyn Fn(Event)) -> Result<(), BakeErr
         schedule: Schedule {
             steps: settings.composition_steps,
             budget_secs: None,
-            rate: settings.rate(COMPOSITION_KNEE, None),
+            rate: settings.rate(COMPOSITION_KNEE, 0, None),
         },
         watch: None,
     };

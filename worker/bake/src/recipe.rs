@@ -384,13 +384,15 @@ impl Settings {
         }
     }
 
-    /// How a network of `ours` learns: its rate falls from step `knee` on; `enough` is the error at which more is not wanted.
-    pub(crate) fn rate(&self, knee: f64, enough: Option<f64>) -> Rate {
+    /// How a network of `ours` learns: its rate falls from step `knee` on. Where it trains while it pays: for how
+    /// long whatever it brings, and the error at which more is not wanted.
+    pub(crate) fn rate(&self, knee: f64, least_steps: u64, enough: Option<f64>) -> Rate {
         match self.preset {
             Preset::Auto => Rate::WhileItPays {
                 knee,
                 worth: Worth {
                     least_gain: self.quality.least_gain(),
+                    least_steps,
                     enough,
                 },
             },

@@ -22,8 +22,6 @@ const FIRST_OBSERVED: u64 = 64;
 const OBSERVED_APART: f64 = std::f64::consts::SQRT_2;
 /// An observation counts as one at half the length up to this share.
 const HALF: f64 = 0.55;
-/// Steps before which nothing is decided: the first ones tell little about the rest.
-const LEAST_STEPS: u64 = 250;
 
 /// How long a stage trains at most, and at what rate.
 #[derive(Clone, Copy, Debug)]
@@ -56,6 +54,8 @@ pub(crate) enum Rate {
 pub(crate) struct Worth {
     /// Share by which a doubling of the stage's length must lower the validation error.
     pub(crate) least_gain: f64,
+    /// Steps before which nothing is decided: the first ones tell little about the rest.
+    pub(crate) least_steps: u64,
     /// Validation error at which the stage ends at once.
     pub(crate) enough: Option<f64>,
 }
@@ -160,7 +160,7 @@ impl Schedule {
         }
         let mut earlier = course.observed.iter().rev();
         let half = earlier.find(|(at, _)| *at <= HALF * progress);
-        if step >= LEAST_STEPS
+        if step >= worth.least_steps
             && let Some((_, Some(before))) = half
             && 1.0 - lowest / before.max(1e-9) < worth.least_gain
         {
@@ -199,6 +199,7 @@ mod tests {
                 knee: 50.0,
                 worth: Worth {
                     least_gain: 0.05,
+                    least_steps: 250,
                     enough,
                 },
             },
@@ -231,7 +232,7 @@ mod tests {
     #[test]
     fn what_does_not_pay_ends_and_what_pays_goes_on() {
         let (_, flat, course) = run(&pays(None), |_| 4.0);
-        assert!((LEAST_STEPS..400).contains(&flat), "{flat}");
+        assert!((250..400).contains(&flat), "{flat}");
         assert!(course.ended_early());
         // A tenth less with each doubling pays; from step 1000 on nothing more comes.
         let falling = |step: u64| (step.max(1) as f64).powf(-0.15);

@@ -33,6 +33,10 @@ const PAPER_EFFECTS_SHARE: f64 = 0.3;
 /// Steps from which on learning rates fall.
 const EFFECTS_KNEE: f64 = 500.0;
 pub(crate) const COMPOSITION_KNEE: f64 = 50.0;
+/// Least steps of a training that lasts while it pays. What `CompositionNet` has learned on other objects is improved on
+/// slowly at first.
+const EFFECTS_LEAST: u64 = 250;
+const COMPOSITION_LEAST: u64 = 500;
 
 /// What one training is called: its row of metrics.json, and its stages in checkpoints.
 #[derive(Clone, Copy, Debug)]
@@ -243,7 +247,7 @@ impl Trainer<'_> {
             let schedule = Schedule {
                 steps: settings.effects_steps,
                 budget_secs: self.budget_secs.map(|secs| secs * share),
-                rate: settings.rate(EFFECTS_KNEE, None),
+                rate: settings.rate(EFFECTS_KNEE, EFFECTS_LEAST, None),
             };
             // Made once, where it is asked for at all.
             let watched = RefCell::new(None);
@@ -337,7 +341,7 @@ impl Trainer<'_> {
             schedule: Schedule {
                 steps: settings.composition_steps,
                 budget_secs,
-                rate: settings.rate(COMPOSITION_KNEE, settings.enough_mse()),
+                rate: settings.rate(COMPOSITION_KNEE, COMPOSITION_LEAST, settings.enough_mse()),
             },
             seed: self.seed,
             secs_before: effects_secs,
