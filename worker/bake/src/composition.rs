@@ -226,16 +226,18 @@ pub(crate) fn train_blend(
             net.forward(params, &with_kind(input, Kind::Float))
         })
     };
-    if settings.pretrained {
-        let error = |params: &Params| errors(params, &validation).map(|(full, _)| full);
-        let (plain, plain_error) = (flat_values(params.flat()), error(&params));
+    let error = |params: &Params| errors(params, &validation).map(|(full, _)| full);
+    let mut outset = None;
+    // Without validation views nobody knows whether the pretrained weights do here.
+    if settings.pretrained
+        && let Some(plain_error) = error(&params)
+    {
+        let plain = flat_values(params.flat());
         if pretrain::fill(&mut params)?
-            && let (Some(plain_error), Some(learned_error)) = (plain_error, error(&params))
+            && let Some(learned_error) = error(&params)
         {
             session.measured(&pretrain::measure(plan.stage), || learned_error);
-            if learned_error > plain_error {
-                params.restore(&plain)?;
-            }
+            outset = Some((plain, plain_error));
         }
     }
     let stage = Stage {
@@ -243,7 +245,8 @@ pub(crate) fn train_blend(
         schedule: plan.schedule,
         watch: Some(Watch {
             keep_best: true,
-            validation: &|params| errors(params, &validation).map(|(full, _)| full),
+            outset,
+            validation: &error,
             curve: Some(Curve {
                 method: plan.method,
                 secs_before: plan.secs_before,
@@ -358,6 +361,7 @@ pub(crate) fn train_generator(
         schedule: plan.schedule,
         watch: Some(Watch {
             keep_best: false,
+            outset: None,
             validation: &|params| errors(params, &validation).map(|(full, _)| full),
             curve: Some(Curve {
                 method: plan.method,

@@ -3,8 +3,8 @@
 //! Deviation: the paper trains `CompositionNet` on each object from random weights. Which of the warped views to trust, by how
 //! they differ, how much of the pixel they see and how they stand to the surface, is much the same everywhere; what is left
 //! to an object's own training is little. The weights are made by [`pretrain`] (`make pretrain`) on generated captures
-//! alone, whose shapes, paintings and lights are no test's. They are where training starts, if they blend better than the
-//! plain weights on the object's validation views; `start=plain` does without. The measured effect is in the README here.
+//! alone, with seeds that nothing else uses. Training starts there; what is kept is plain blending until training is better on the
+//! object's validation views. `start=plain` does without. The measured effect is in the README here.
 
 use std::path::PathBuf;
 
@@ -32,18 +32,7 @@ const WEIGHTS: &[u8] = include_bytes!("../pretrained/composition.safetensors");
 /// Puts the pretrained weights in; whether they fit the network, which else stays as it is.
 pub(crate) fn fill(params: &mut Params) -> Result<bool, BakeError> {
     let tensors = weights::decode(FILE, WEIGHTS)?;
-    let shapes: std::collections::BTreeMap<&str, Vec<i64>> = tensors
-        .iter()
-        .map(|(name, tensor)| {
-            let shape = tensor.shape.iter().map(|&n| n as i64).collect();
-            (name.as_str(), shape)
-        })
-        .collect();
-    let filled = params.import(|name| {
-        let shape = shapes.get(name)?;
-        Some((shape.as_slice(), tensors.get(name)?.values.as_slice()))
-    });
-    match filled {
+    match ign_render::import(params, &tensors) {
         Ok(()) => Ok(true),
         Err(NetError::WrongShape { .. }) => Ok(false),
         Err(error) => Err(error.into()),

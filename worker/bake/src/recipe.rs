@@ -333,7 +333,7 @@ impl Recipe {
             effects_steps: if paper { epochs(64) } else { 2000 },
             effects_batch: 8192,
             composition_steps: if paper { epochs(64) } else { 1000 },
-            pretrained: true,
+            pretrained: !paper,
             width: BLEND_WIDTH,
             batch: 4,
             patch: 64,

@@ -395,16 +395,24 @@ fn blend_width(tensors: &Tensors) -> i64 {
 }
 
 fn filled(builder: Builder, tensors: &Tensors, device: Device) -> Result<Params, RenderError> {
+    let mut params = builder.build(device, 0);
+    import(&mut params, tensors)?;
+    Ok(params)
+}
+
+/// Overwrites a network's tensors by those of a weights file.
+///
+/// # Errors
+/// Those of [`Params::import`]; nothing is changed then.
+pub fn import(params: &mut Params, tensors: &Tensors) -> Result<(), NetError> {
     let shapes: std::collections::BTreeMap<&str, Vec<i64>> = tensors
         .iter()
         .map(|(name, t)| (name.as_str(), t.shape.iter().map(|&n| n as i64).collect()))
         .collect();
-    let mut params = builder.build(device, 0);
     params.import(|name| {
         let shape = shapes.get(name)?;
         tensors
             .get(name)
             .map(|t| (shape.as_slice(), t.values.as_slice()))
-    })?;
-    Ok(params)
+    })
 }

@@ -16,7 +16,7 @@ mod target;
 mod translation;
 
 pub use baselines::{debevec_ibr, naive_ibr};
-pub use bundle::{BundleRenderer, NetworkFiles, RenderError, orbit};
+pub use bundle::{BundleRenderer, NetworkFiles, RenderError, import, orbit};
 pub use camera_file::{CameraFileError, parse_cameras, read_cameras};
 pub use model::{Composition, Effects, Model};
 pub use references::{ReferenceImage, References, Warped};
