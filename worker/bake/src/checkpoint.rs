@@ -76,8 +76,6 @@ pub(crate) struct Watch<'a> {
     /// Whether the weights of the lowest validation error are kept, not those of the end. The curve is the error of what
     /// would be kept if training ended there.
     pub(crate) keep_best: bool,
-    /// Weights, with their error on the validation views, that are kept until training is better.
-    pub(crate) outset: Option<(Vec<f32>, f64)>,
     /// Error on the validation views; `None` when there are none.
     pub(crate) validation: &'a dyn Fn(&Params) -> Option<f64>,
     pub(crate) curve: Option<Curve<'a>>,
@@ -267,8 +265,7 @@ impl<'a> Session<'a> {
         mut step: impl FnMut(&mut [Trainee], u64, f64) -> f64,
     ) -> Result<(), BakeError> {
         let (name, schedule) = (stage.name, &stage.schedule);
-        let outset = stage.watch.as_ref().and_then(|it| it.outset.as_ref());
-        let mut best = outset.map(|(weights, _)| weights.clone());
+        let mut best = None;
         let mut current = match self.meta.current.take() {
             Some(current) if current.stage == name => {
                 if let Some(snapshot) = self.resumed.take() {
@@ -394,9 +391,7 @@ impl<'a> Session<'a> {
         current: &Current,
         best: &mut Option<Vec<f32>>,
     ) {
-        let outset = watch.outset.as_ref().map(|(_, error)| *error);
-        let lowest = outset.into_iter().chain(current.course.lowest());
-        let better = match (error, lowest.reduce(f64::min)) {
+        let better = match (error, current.course.lowest()) {
             (Some(error), Some(lowest)) => error <= lowest,
             _ => true,
         };
@@ -679,7 +674,6 @@ mod tests {
     fn watch() -> Watch<'static> {
         Watch {
             keep_best: true,
-            outset: None,
             validation: &|params| Some(value(params).powi(2)),
             curve: Some(Curve {
                 method: "ours",

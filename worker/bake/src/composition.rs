@@ -227,7 +227,6 @@ pub(crate) fn train_blend(
         })
     };
     let error = |params: &Params| errors(params, &validation).map(|(full, _)| full);
-    let mut outset = None;
     // Without validation views nobody knows whether the pretrained weights do here.
     if settings.pretrained
         && let Some(plain_error) = error(&params)
@@ -237,7 +236,9 @@ pub(crate) fn train_blend(
             && let Some(learned_error) = error(&params)
         {
             session.measured(&pretrain::measure(plan.stage), || learned_error);
-            outset = Some((plain, plain_error));
+            if learned_error > plain_error {
+                params.restore(&plain)?;
+            }
         }
     }
     let stage = Stage {
@@ -245,7 +246,6 @@ pub(crate) fn train_blend(
         schedule: plan.schedule,
         watch: Some(Watch {
             keep_best: true,
-            outset,
             validation: &error,
             curve: Some(Curve {
                 method: plan.method,
@@ -361,7 +361,6 @@ pub(crate) fn train_generator(
         schedule: plan.schedule,
         watch: Some(Watch {
             keep_best: false,
-            outset: None,
             validation: &|params| errors(params, &validation).map(|(full, _)| full),
             curve: Some(Curve {
                 method: plan.method,

@@ -206,7 +206,6 @@ pub(crate) fn train_points(
         schedule: plan.schedule,
         watch: ends_on_the_way.then_some(Watch {
             keep_best: false,
-            outset: None,
             validation: &validation,
             curve: None,
         }),

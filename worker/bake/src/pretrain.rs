@@ -3,8 +3,8 @@
 //! Deviation: the paper trains `CompositionNet` on each object from random weights. Which of the warped views to trust, by how
 //! they differ, how much of the pixel they see and how they stand to the surface, is much the same everywhere; what is left
 //! to an object's own training is little. The weights are made by [`pretrain`] (`make pretrain`) on generated captures
-//! alone, with seeds that nothing else uses. Training starts there; what is kept is plain blending until training is better on the
-//! object's validation views. `start=plain` does without. The measured effect is in the README here.
+//! alone, with seeds that nothing else uses. Training starts there if they blend better than plain blending on the object's
+//! validation views; `start=plain` does without. The measured effect is in the README here.
 
 use std::path::PathBuf;
 
