@@ -6,7 +6,8 @@
 //! alone, with seeds that nothing else uses. Training starts there if they blend better than plain blending on the object's
 //! validation views; `start=plain` does without. The measured effect is in the README here.
 
-use std::path::PathBuf;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
 
 use ign_bundle::weights::{self, Precision};
 use ign_capture::{Gains, ImportOptions};
@@ -66,6 +67,10 @@ pub fn pretrain(job: &PretrainJob, events: &dyn Fn(Event)) -> Result<(), BakeErr
     ign_nets::device::limit_threads(job.threads);
     let device = ign_nets::select_device();
     let work = tempfile::tempdir().map_err(io(&std::env::temp_dir()))?;
+    // Beside its place: a place that cannot be written shows before the training, and what is there stays until its end.
+    let folder = job.out.parent().filter(|it| !it.as_os_str().is_empty());
+    let mut file =
+        tempfile::NamedTempFile::new_in(folder.unwrap_or(Path::new("."))).map_err(io(&job.out))?;
     let open = |name: &str| {
         let dir = work.path().join(name);
         Session::open(&reporter, &dir, f64::INFINITY, &job.recipe, name, None)
@@ -127,7 +132,9 @@ pub fn pretrain(job: &PretrainJob, events: &dyn Fn(Event)) -> Result<(), BakeErr
     let composition = Composition::Blend(net, params);
     let files = NetworkFiles::of_composition(&composition, settings.k, Precision::Fp16);
     let bytes = weights::encode(FILE, &files.tensors, Precision::Fp16)?;
-    std::fs::write(&job.out, bytes).map_err(io(&job.out))
+    file.write_all(&bytes).map_err(io(&job.out))?;
+    let written = file.persist(&job.out);
+    written.map(drop).map_err(|error| io(&job.out)(error.error))
 }
 
 #[cfg(test)]

@@ -351,15 +351,15 @@ fn load_effects(
     device: Device,
 ) -> Result<Effects, RenderError> {
     let mut builder = Builder::new();
-    let tensors = bundle.weights(network)?;
+    let filled = |builder| filled(builder, &bundle.weights(network)?, device);
     match network.kind.as_str() {
         PAPER_EFFECTS => {
             let net = PaperEffects::new(&mut builder);
-            Ok(Effects::Paper(net, filled(builder, &tensors, device)?))
+            Ok(Effects::Paper(net, filled(builder)?))
         }
         POINT_EFFECTS => {
             let net = PointEffects::new(&mut builder);
-            Ok(Effects::Points(net, filled(builder, &tensors, device)?))
+            Ok(Effects::Points(net, filled(builder)?))
         }
         kind => Err(RenderError::UnknownNetwork { kind: kind.into() }),
     }
@@ -372,13 +372,14 @@ fn load_composition(
     device: Device,
 ) -> Result<Composition, RenderError> {
     let mut builder = Builder::new();
-    let tensors = bundle.weights(network)?;
     match network.kind.as_str() {
         PAPER_COMPOSITION => {
             let net = PaperComposition::new(&mut builder, PaperComposition::input_channels(k));
+            let tensors = bundle.weights(network)?;
             Ok(Composition::Paper(net, filled(builder, &tensors, device)?))
         }
         BLEND_COMPOSITION => {
+            let tensors = bundle.weights(network)?;
             let net = BlendComposition::new(&mut builder, k, blend_width(&tensors));
             Ok(Composition::Blend(net, filled(builder, &tensors, device)?))
         }

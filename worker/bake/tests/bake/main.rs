@@ -9,7 +9,7 @@ mod hard;
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 
-use ign_bake::{BakeJob, Event, Recipe, bake};
+use ign_bake::{BakeJob, Event, PretrainJob, Recipe, bake, pretrain};
 use ign_bundle::Bundle;
 use ign_demo::DemoOptions;
 use ign_events::FailureKind;
@@ -161,6 +161,41 @@ fn a_bundle_renders_what_was_scored() {
             );
         }
     }
+}
+
+#[test]
+fn pretraining_writes_weights_of_the_network_that_was_asked_for() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let captures: Vec<PathBuf> = [("matte", 0.0), ("glossy", 0.9)]
+        .map(|(name, gloss)| capture(&dir.path().join(name), gloss))
+        .into();
+    let job = |captures: &[PathBuf], out: &str| PretrainJob {
+        captures: captures.to_owned(),
+        recipe: recipe(&[("width", "8")]),
+        out: dir.path().join(out),
+        threads: 1,
+    };
+    let made = |out: &str| {
+        pretrain(&job(&captures, out), &|_| {}).expect("weights");
+        std::fs::read(dir.path().join(out)).expect("a file")
+    };
+    let bytes = made("first");
+    assert_eq!(bytes, made("second"), "the same seed, other weights");
+    let tensors = ign_bundle::weights::decode("first", &bytes).expect("weights");
+    let shape = |name: &str| tensors.get(name).map(|tensor| tensor.shape.clone());
+    assert_eq!(shape("composition.stem.weight"), Some(vec![8, 33, 3, 3]));
+    // It learned: the head starts at zero.
+    let head = &tensors["composition.head.weight"].values;
+    assert!(head.iter().any(|value| *value != 0.0));
+
+    let error = pretrain(&job(&[], "first"), &|_| {}).expect_err("no capture");
+    assert!(error.failure().hint.contains("demo-capture"), "{error}");
+    let error = pretrain(&job(&captures, "absent/file"), &|_| {}).expect_err("no folder");
+    assert!(error.failure().message.contains("absent/file"), "{error}");
+    assert_eq!(
+        std::fs::read(dir.path().join("first")).expect("a file"),
+        bytes
+    );
 }
 
 /// Every method has its row, and those that train their curve.
