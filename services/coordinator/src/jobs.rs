@@ -54,9 +54,14 @@ impl App {
 
     async fn full_jobs(&self, jobs: &[Job]) -> Result<Vec<v1::Job>, Refused> {
         let waiting = self.store.all_waiting(jobs).await?;
+        self.with_bundles(jobs.iter().zip(waiting)).await
+    }
+
+    async fn with_bundles(
+        &self,
+        jobs: impl Iterator<Item = (&Job, Waiting)>,
+    ) -> Result<Vec<v1::Job>, Refused> {
         let lookups: Vec<_> = jobs
-            .iter()
-            .zip(waiting)
             .map(|(job, waiting)| self.with_bundle(job, waiting))
             .collect();
         stream::iter(lookups)
@@ -383,6 +388,10 @@ impl Jobs for JobsApi {
         let collection = optional(&request.get_ref().collection, "collection")?;
         let reach = caller.reach(Scope::Read).narrow(collection)?;
         let status = self.0.screen(&caller, &reach).await?;
+        let queued = status
+            .next_queued
+            .iter()
+            .map(|(job, waiting)| (job, waiting.clone()));
         Ok(Response::new(v1::StatusResponse {
             jobs_by_state: status
                 .counts
@@ -394,7 +403,7 @@ impl Jobs for JobsApi {
             recent_failures: status.recent_failures.iter().map(to_job).collect(),
             server_version: env!("CARGO_PKG_VERSION").to_owned(),
             at: Some(to_timestamp(status.at)),
-            next_queued: self.0.full_jobs(&status.next_queued).await?,
+            next_queued: self.0.with_bundles(queued).await?,
             lease_secs: self.0.store.settings().lease.as_secs_f64(),
         }))
     }
@@ -405,27 +414,33 @@ fn add(whole: &mut Screen, part: Screen) {
     for (state, count) in part.counts {
         *whole.counts.entry(state).or_default() += count;
     }
-    let merge = |into: &mut Vec<Job>, from: Vec<Job>, order: fn(&Job, &Job) -> Ordering| {
-        into.extend(from);
-        into.sort_by(order);
-        into.truncate(STATUS_ROWS as usize);
-    };
     merge(&mut whole.running, part.running, |a, b| {
         (a.started_at, a.id).cmp(&(b.started_at, b.id))
     });
     merge(&mut whole.recent_failures, part.recent_failures, |a, b| {
         (b.finished_at, a.id).cmp(&(a.finished_at, b.id))
     });
-    merge(&mut whole.next_queued, part.next_queued, |a, b| {
-        let order = |job: &Job| {
-            (
-                std::cmp::Reverse(job.spec.priority),
-                job.submitted_at,
-                job.id,
-            )
-        };
-        order(a).cmp(&order(b))
-    });
+    merge(
+        &mut whole.next_queued,
+        part.next_queued,
+        |(a, _), (b, _)| {
+            let order = |job: &Job| {
+                (
+                    std::cmp::Reverse(job.spec.priority),
+                    job.submitted_at,
+                    job.id,
+                )
+            };
+            order(a).cmp(&order(b))
+        },
+    );
+}
+
+/// Merges two parts of a list of the status screen.
+fn merge<T>(into: &mut Vec<T>, from: Vec<T>, order: fn(&T, &T) -> Ordering) {
+    into.extend(from);
+    into.sort_by(order);
+    into.truncate(STATUS_ROWS as usize);
 }
 
 /// Why a stream ended before its time; none when the client went away.

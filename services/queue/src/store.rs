@@ -344,8 +344,8 @@ pub struct Status {
     pub running: Vec<Job>,
     /// Failed jobs, the latest first.
     pub recent_failures: Vec<Job>,
-    /// Queued jobs by priority and age.
-    pub next_queued: Vec<Job>,
+    /// Queued jobs by priority and age, with what they wait for.
+    pub next_queued: Vec<(Job, Waiting)>,
     /// The database's time.
     pub at: DateTime<Utc>,
 }

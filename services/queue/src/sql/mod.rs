@@ -29,7 +29,6 @@ use crate::store::{
     MAX_PAGE, Named, NewLogLine, NewVersion, Orders, Reaped, Result, Settings, Standing, Status,
     Store, StoreError, Submit, Version, VersionFilter, Waiting, Worker, WorkerInfo,
 };
-use crate::waiting::{Rival, Surroundings, describe};
 
 mod jobs;
 mod leases;
@@ -49,7 +48,7 @@ use versions::{
     PublishAsk, find_version, insert_versions, lock_object, point_alias, point_latest,
     select_versions, set_retired,
 };
-use waiting::{QueueCounts, all_queues, older_equals, queue_place};
+use waiting::{Counted, all_queues, all_waiting, nothing};
 use webhooks::announce;
 
 type DbRow = <Db as sqlx::Database>::Row;
@@ -159,6 +158,20 @@ impl SqlStore {
         };
         self.finish(transaction, outcome, change).await
     }
+}
+
+/// How many workers could take a job.
+async fn ready_workers(
+    reader: &mut Connection,
+    lease: Duration,
+    now: DateTime<Utc>,
+) -> Result<u64> {
+    let workers: i64 =
+        sqlx::query_scalar("select count(*) from workers where not draining and last_seen_at > $1")
+            .bind(to_db(now - lease))
+            .fetch_one(reader)
+            .await?;
+    Ok(count(workers))
 }
 
 async fn list_workers(connection: &mut Connection, now: DateTime<Utc>) -> Result<Vec<Worker>> {
@@ -328,65 +341,14 @@ impl Store for SqlStore {
     }
 
     async fn all_waiting(&self, jobs: &[Job]) -> Result<Vec<Waiting>> {
-        let mut queued: Vec<&Job> = jobs
-            .iter()
-            .filter(|job| job.state == JobState::Queued)
-            .collect();
-        let nothing = || Waiting {
-            position: 0,
-            reason: String::new(),
-        };
-        if queued.is_empty() {
+        if jobs.iter().all(|job| job.state != JobState::Queued) {
             return Ok(jobs.iter().map(|_| nothing()).collect());
         }
         let mut reader = self.backend.reader().acquire().await?;
         let now = Backend::now(&mut reader).await?;
-        let workers: i64 = sqlx::query_scalar(
-            "select count(*) from workers where not draining and last_seen_at > $1",
-        )
-        .bind(to_db(now - self.settings.lease))
-        .fetch_one(&mut *reader)
-        .await?;
-        let queues = all_queues(&mut reader).await?;
-        queued.sort_by_key(|job| queue_place(job));
-        let older = older_equals(&mut reader, &queued).await?;
-        jobs.iter()
-            .map(|job| {
-                let Some(older) = older.get(&job.id) else {
-                    return Ok(nothing());
-                };
-                let name = &job.spec.object.collection;
-                let own = queues
-                    .get(name)
-                    .ok_or_else(|| internal(format!("a job's collection {name} is missing")))?;
-                let higher = |queue: &QueueCounts| -> u64 {
-                    let from = i64::from(job.spec.priority) + 1;
-                    queue.by_priority.range(from..).map(|(_, jobs)| jobs).sum()
-                };
-                let others = queues
-                    .values()
-                    .filter(|other| other.collection.name != *name && !other.collection.paused)
-                    .map(|other| Rival {
-                        weight: other.collection.weight,
-                        higher: higher(other),
-                        equal: other
-                            .by_priority
-                            .get(&i64::from(job.spec.priority))
-                            .copied()
-                            .unwrap_or(0),
-                    })
-                    .collect();
-                let around = Surroundings {
-                    collection: own.collection.clone(),
-                    running: own.running,
-                    ahead: higher(own) + older,
-                    others,
-                    workers: count(workers),
-                    now,
-                };
-                Ok(describe(job, &around))
-            })
-            .collect()
+        let workers = ready_workers(&mut reader, self.settings.lease, now).await?;
+        let queues = all_queues(&mut reader, Counted::None).await?;
+        all_waiting(&mut reader, jobs, &queues, workers, now).await
     }
 
     async fn cancel(&self, job: JobId) -> Result<Job> {
@@ -431,21 +393,15 @@ impl Store for SqlStore {
         let limit = i64::from(limit.min(MAX_PAGE));
         let mut reader = self.backend.reader().acquire().await?;
         let now = Backend::now(&mut reader).await?;
+        let counted = collection.map_or(Counted::All, Counted::Of);
+        let queues = all_queues(&mut reader, counted).await?;
         let mut counts: BTreeMap<JobState, u64> =
             JobState::ALL.into_iter().map(|state| (state, 0)).collect();
-        let mut query = QueryBuilder::<Db>::new("select state, count(*) as jobs from jobs");
-        if let Some(collection) = collection {
-            query
-                .push(" where collection = ")
-                .push_bind(collection.as_str());
-        }
-        for row in query
-            .push(" group by state")
-            .build()
-            .fetch_all(&mut *reader)
-            .await?
-        {
-            counts.insert(parse(row.try_get("state")?)?, count(row.try_get("jobs")?));
+        let shown = |name: &CollectionId| collection.is_none_or(|only| only == name);
+        for (_, queue) in queues.iter().filter(|(name, _)| shown(name)) {
+            for (state, jobs) in &queue.by_state {
+                *counts.entry(*state).or_default() += jobs;
+            }
         }
         let mut some = async |state, order| {
             let mut query = select_jobs(collection, state);
@@ -458,14 +414,16 @@ impl Store for SqlStore {
         };
         let running = some(JobState::Leased, "started_at, id").await?;
         let recent_failures = some(JobState::Failed, "finished_at desc, id").await?;
-        let next_queued = some(JobState::Queued, "priority desc, submitted_at, id").await?;
+        let queued = some(JobState::Queued, "priority desc, submitted_at, id").await?;
+        let ready = ready_workers(&mut reader, self.settings.lease, now).await?;
+        let waiting = all_waiting(&mut reader, &queued, &queues, ready, now).await?;
         let workers = list_workers(&mut reader, now).await?;
         Ok(Status {
             counts,
             workers,
             running,
             recent_failures,
-            next_queued,
+            next_queued: queued.into_iter().zip(waiting).collect(),
             at: now,
         })
     }

@@ -1,4 +1,4 @@
-//! What a queued job waits for.
+//! How many jobs there are, and what a queued one waits for.
 
 use std::collections::BTreeMap;
 
@@ -8,20 +8,34 @@ use sqlx::{QueryBuilder, Row};
 
 use super::super::{Connection, Db, from_key, key, to_db};
 use super::CHUNK;
-use super::rows::{collection_from, count, parse};
-use crate::state::Job;
-use crate::store::{Collection, Result};
+use super::rows::{collection_from, count, internal, parse};
+use crate::state::{Job, JobState};
+use crate::store::{Collection, Result, Waiting};
+use crate::waiting::{Rival, Surroundings, describe};
 
-/// A collection and how many jobs wait in it.
+/// A collection and how many jobs are in it.
 #[derive(Debug)]
 pub(super) struct QueueCounts {
     pub(super) collection: Collection,
     pub(super) running: u64,
+    /// Those that wait.
     pub(super) by_priority: BTreeMap<i64, u64>,
+    /// All of it, where [`Counted`] asks for it.
+    pub(super) by_state: BTreeMap<JobState, u64>,
 }
 
+/// Of which collections jobs are counted that do not wait.
+#[derive(Clone, Copy)]
+pub(super) enum Counted<'a> {
+    None,
+    Of(&'a CollectionId),
+    All,
+}
+
+/// All collections; one look at the table, which is what a screen over very many jobs costs.
 pub(super) async fn all_queues(
     reader: &mut Connection,
+    counted: Counted<'_>,
 ) -> Result<BTreeMap<CollectionId, QueueCounts>> {
     let rows = sqlx::query(
         "select c.*, (select count(*) from jobs j where j.collection = c.name and j.state = 'leased') as running \
@@ -35,27 +49,40 @@ pub(super) async fn all_queues(
         let counts = QueueCounts {
             running: count(row.try_get("running")?),
             by_priority: BTreeMap::new(),
+            by_state: BTreeMap::new(),
             collection,
         };
         queues.insert(counts.collection.name.clone(), counts);
     }
-    let rows = sqlx::query(
-        "select collection, priority, count(*) as jobs from jobs where state = 'queued' group by collection, priority",
-    )
-    .fetch_all(reader)
-    .await?;
-    for row in rows {
+    let mut query =
+        QueryBuilder::<Db>::new("select collection, priority, state, count(*) as jobs from jobs");
+    match counted {
+        Counted::None => drop(query.push(" where state = 'queued'")),
+        Counted::Of(collection) => {
+            query
+                .push(" where state = 'queued' or collection = ")
+                .push_bind(collection.as_str());
+        }
+        Counted::All => {}
+    }
+    query.push(" group by collection, priority, state");
+    for row in query.build().fetch_all(reader).await? {
         let name: CollectionId = parse(row.try_get("collection")?)?;
-        if let Some(queue) = queues.get_mut(&name) {
-            let jobs = count(row.try_get("jobs")?);
+        let Some(queue) = queues.get_mut(&name) else {
+            continue;
+        };
+        let jobs = count(row.try_get("jobs")?);
+        let state = parse(row.try_get("state")?)?;
+        if state == JobState::Queued {
             queue.by_priority.insert(row.try_get("priority")?, jobs);
         }
+        *queue.by_state.entry(state).or_default() += jobs;
     }
     Ok(queues)
 }
 
 /// Where a job stands among the queued ones.
-pub(super) fn queue_place(job: &Job) -> (CollectionId, i32, DateTime<Utc>, JobId) {
+fn queue_place(job: &Job) -> (CollectionId, i32, DateTime<Utc>, JobId) {
     (
         job.spec.object.collection.clone(),
         job.spec.priority,
@@ -66,10 +93,7 @@ pub(super) fn queue_place(job: &Job) -> (CollectionId, i32, DateTime<Utc>, JobId
 
 /// For each of some queued jobs, sorted by [`queue_place`], how many of the same collection and priority are older. Each
 /// stretch of the queue between two of them is counted once.
-pub(super) async fn older_equals(
-    reader: &mut Connection,
-    jobs: &[&Job],
-) -> Result<BTreeMap<JobId, u64>> {
+async fn older_equals(reader: &mut Connection, jobs: &[&Job]) -> Result<BTreeMap<JobId, u64>> {
     let mut between = BTreeMap::new();
     let before = std::iter::once(None).chain(jobs.iter().copied().map(Some));
     let stretches: Vec<_> = before.zip(jobs.iter().copied()).collect();
@@ -108,4 +132,65 @@ pub(super) async fn older_equals(
         older.insert(job.id, so_far + between.get(&job.id).copied().unwrap_or(0));
     }
     Ok(older)
+}
+
+/// What each of some jobs waits for, in their order.
+pub(super) async fn all_waiting(
+    reader: &mut Connection,
+    jobs: &[Job],
+    queues: &BTreeMap<CollectionId, QueueCounts>,
+    workers: u64,
+    now: DateTime<Utc>,
+) -> Result<Vec<Waiting>> {
+    let mut queued: Vec<&Job> = jobs
+        .iter()
+        .filter(|job| job.state == JobState::Queued)
+        .collect();
+    queued.sort_by_key(|job| queue_place(job));
+    let older = older_equals(reader, &queued).await?;
+    jobs.iter()
+        .map(|job| {
+            let Some(older) = older.get(&job.id) else {
+                return Ok(nothing());
+            };
+            let name = &job.spec.object.collection;
+            let own = queues
+                .get(name)
+                .ok_or_else(|| internal(format!("a job's collection {name} is missing")))?;
+            let higher = |queue: &QueueCounts| -> u64 {
+                let from = i64::from(job.spec.priority) + 1;
+                queue.by_priority.range(from..).map(|(_, jobs)| jobs).sum()
+            };
+            let others = queues
+                .values()
+                .filter(|other| other.collection.name != *name && !other.collection.paused)
+                .map(|other| Rival {
+                    weight: other.collection.weight,
+                    higher: higher(other),
+                    equal: other
+                        .by_priority
+                        .get(&i64::from(job.spec.priority))
+                        .copied()
+                        .unwrap_or(0),
+                })
+                .collect();
+            let around = Surroundings {
+                collection: own.collection.clone(),
+                running: own.running,
+                ahead: higher(own) + older,
+                others,
+                workers,
+                now,
+            };
+            Ok(describe(job, &around))
+        })
+        .collect()
+}
+
+/// What a job that is not queued waits for.
+pub(super) fn nothing() -> Waiting {
+    Waiting {
+        position: 0,
+        reason: String::new(),
+    }
 }

@@ -210,8 +210,8 @@ pub(crate) async fn batches_answer_each_request(bench: &Bench) {
     let listed: Vec<_> = status
         .next_queued
         .iter()
-        .filter(|job| job.spec.object == name("museum/vase"))
-        .map(|job| job.request_id.clone())
+        .filter(|(job, _)| job.spec.object == name("museum/vase"))
+        .map(|(job, _)| job.request_id.clone())
         .collect();
     assert_eq!(listed[..], museum[..listed.len()]);
     assert!(
@@ -841,7 +841,7 @@ pub(crate) async fn limits_hold_under_concurrent_leases(bench: &Bench) {
     }
     let leased: Vec<_> = tasks.join_all().await.into_iter().flatten().collect();
     assert_eq!(leased.len(), 3);
-    let next = bench
+    let (next, _) = bench
         .store
         .status(None, 1)
         .await
@@ -1259,7 +1259,12 @@ pub(crate) async fn status_shows_one_screen(bench: &Bench) {
     let ids = |jobs: &[ign_queue::Job]| jobs.iter().map(|job| job.id).collect::<Vec<_>>();
     assert_eq!(ids(&status.running), [running.id]);
     assert_eq!(ids(&status.recent_failures), [lost.id]);
-    assert_eq!(ids(&status.next_queued), [high.id, low.id]);
+    let next: Vec<_> = status.next_queued.iter().map(|(job, _)| job.id).collect();
+    assert_eq!(next, [high.id, low.id]);
+    for (job, waiting) in &status.next_queued {
+        assert_eq!(*waiting, bench.store.waiting(job).await.unwrap());
+        assert_ne!(waiting.reason, "");
+    }
     let workers: Vec<_> = status
         .workers
         .iter()
@@ -1274,6 +1279,7 @@ pub(crate) async fn status_shows_one_screen(bench: &Bench) {
         .await
         .unwrap();
     assert_eq!(library.counts[&JobState::Queued], 1);
+    assert_eq!(library.counts.values().sum::<u64>(), 1);
     assert_eq!((library.running.len(), library.next_queued.len()), (0, 1));
     bench.store.ping().await.unwrap();
 }
