@@ -77,15 +77,16 @@ ablation: build
 # Seeds from 100 on are for this alone: no test and no demonstration uses them.
 pretrain: build
 	@set -eu; bin=$(BIN); out=bake-out/pretrain; seed=100; \
-	for gloss in 0 0.3 0.6 0.9; do for shape in vase bowl sphere; do \
+	for off in 0 0.8; do for gloss in 0 0.3 0.6 0.9; do for shape in vase bowl sphere; do \
 		seed=$$((seed + 1)); size=$$((96 + 96 * (seed % 2))); capture=$$out/$$shape-$$seed; \
 		if [ ! -e "$$capture/test.txt" ]; then \
 			rm -rf "$$capture"; mkdir -p "$$out"; \
-			"$$bin/ign-worker" demo-capture "$$capture" --shape "$$shape" --gloss "$$gloss" --seed "$$seed" --size "$$size" --views 64; \
+			"$$bin/ign-worker" demo-capture "$$capture" --shape "$$shape" --gloss "$$gloss" --seed "$$seed" --size "$$size" --views 64 \
+				--misregistration "$$off"; \
 		fi; \
-	done; done; \
+	done; done; done; \
 	"$$bin/ign-worker" pretrain "$$out"/*-1* --out worker/bake/pretrained/composition.safetensors --size 96 \
-		--set effects_steps=300 --set composition_steps=6000 $(ARGS)
+		--set effects_steps=300 --set composition_steps=12000 $(ARGS)
 
 bench:
 	python3 tests/bench/run.py $(BENCH) $(ARGS)

@@ -35,6 +35,9 @@ pub(crate) struct Options {
     /// Turn the object under fixed lamps instead of moving the camera: light that is not constant.
     #[arg(long)]
     turntable: bool,
+    /// Pixels by which the proxy is off, and twice those by which the poses are, as after a reconstruction.
+    #[arg(long, value_name = "PX", default_value_t = 0.0)]
+    misregistration: f64,
 }
 
 pub(crate) fn run(options: &Options) -> Result<()> {
@@ -47,6 +50,7 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         orbit: options.orbit,
         seed: options.seed,
         turntable: options.turntable,
+        misregistration: options.misregistration,
     };
     let steps = std::cell::RefCell::new(Steps::new(
         "views traced",

@@ -82,6 +82,7 @@ pub fn pretrain(job: &PretrainJob, events: &dyn Fn(Event)) -> Result<(), BakeErr
         let settings = job.recipe.resolve(scene.train.len())?;
         let gains = Gains::none(scene.views.len());
         let mut data = Dataset::new(&scene, &gains, &job.recipe, &settings, device, work.path())?;
+        data.fit_proxy(settings.fit)?;
         let chosen = data.choose_references(settings.references);
         data.settle_proxy(settings.simplify);
         let drawn = Drawn::new(&data, &chosen, data.settings.clone(), data.reference_scale)?;

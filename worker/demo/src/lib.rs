@@ -15,11 +15,13 @@
 //! ```
 //!
 //! Paths: `shape` makes the triangles, `paint` their colour, `trace` finds what a ray hits, `light` shades it,
-//! `path` places the cameras, `render` makes one view, `write` puts it on disk.
+//! `path` places the cameras, `render` makes one view, `reconstruction` puts proxy and poses a little off, `write` puts
+//! it on disk.
 
 mod light;
 mod paint;
 mod path;
+mod reconstruction;
 mod render;
 mod shape;
 mod trace;
@@ -91,6 +93,9 @@ pub struct DemoOptions {
     /// The object turns in front of the lamps and the camera moves only up, down and nearer: seen from the object, the
     /// lamps go round with the camera. Constant light, which every method here assumes, is then broken.
     pub turntable: bool,
+    /// How far the proxy that is delivered is from the surface that was traced, as the standard deviation of dents and
+    /// bulges in widths of a pixel; its poses are off by half as many pixels. 0: exact.
+    pub misregistration: f64,
 }
 
 impl Default for DemoOptions {
@@ -104,6 +109,7 @@ impl Default for DemoOptions {
             orbit: None,
             seed: 0,
             turntable: false,
+            misregistration: 0.0,
         }
     }
 }
@@ -111,6 +117,8 @@ impl Default for DemoOptions {
 /// Limits that keep a mistyped option from filling the disk.
 const LARGEST_SIZE: u32 = 4096;
 const MOST_VIEWS: usize = 10_000;
+/// Pixels; with more of it proxies fold over.
+const MOST_MISREGISTRATION: f64 = 8.0;
 
 impl DemoOptions {
     /// Views of the spiral that are held out.
@@ -136,6 +144,12 @@ impl DemoOptions {
             return refuse(format!(
                 "views is {}, expected 3 to {MOST_VIEWS}",
                 self.views
+            ));
+        }
+        if !(0.0..=MOST_MISREGISTRATION).contains(&self.misregistration) {
+            return refuse(format!(
+                "misregistration is {}, expected 0 to {MOST_MISREGISTRATION} pixels",
+                self.misregistration
             ));
         }
         if let Some(frames) = self.orbit {
@@ -205,6 +219,13 @@ pub enum DemoError {
         #[source]
         source: image::ImageError,
     },
+    /// A proxy that cannot be displaced.
+    #[error("cannot displace the proxy")]
+    Proxy {
+        /// Why.
+        #[source]
+        source: ign_geometry::MeshError,
+    },
     /// A camera that cannot be placed.
     #[error("cannot place camera {view}")]
     Camera {
@@ -240,8 +261,6 @@ pub fn generate(
 
     write::folders(&staging.dir)?;
     let colors = write::vertex_colors(&surface, &paint, &lighting);
-    write::mesh(&staging.dir, &surface, &colors)?;
-    write::model(&staging.dir, &views, &surface, &tracer, &colors)?;
     write::lists(&staging.dir, &views, options)?;
     let renderer = render::Renderer {
         surface: &surface,
@@ -257,13 +276,19 @@ pub fn generate(
         progress(done + 1, views.len());
     }
 
+    let seen = write::observations(&views, &surface, &tracer);
+    let cameras = reconstruction::cameras(&views, options);
+    let proxy = reconstruction::proxy(surface, options)?;
+    write::mesh(&staging.dir, &proxy, &colors)?;
+    write::model(&staging.dir, (&views, &cameras), &seen, &proxy, &colors)?;
+
     let held_out = views.iter().filter(|view| view.held_out).count();
     staging.publish(out)?;
     Ok(DemoSummary {
         dir: out.to_owned(),
         train: views.len() - held_out,
         held_out,
-        triangles: surface.triangles.len(),
+        triangles: proxy.triangles.len(),
     })
 }
 

@@ -426,13 +426,14 @@ fn linear(value: u8) -> f64 {
 }
 
 /// Value noise on the integer lattice.
-struct Noise {
-    seed: u32,
+/// Smooth noise in space.
+pub(crate) struct Noise {
+    pub(crate) seed: u32,
 }
 
 impl Noise {
     /// Two octaves, in [0, 1] with mean 0.5.
-    fn fractal(&self, p: DVec3) -> f64 {
+    pub(crate) fn fractal(&self, p: DVec3) -> f64 {
         (2.0 * self.value(p) + self.value(p * 2.17 + DVec3::splat(5.3))) / 3.0
     }
 

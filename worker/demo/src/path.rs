@@ -14,12 +14,12 @@ const ROUNDS: f64 = 5.0;
 /// Elevation at its start and end, degrees.
 const ELEVATION: (f64, f64) = (-14.0, 64.0);
 /// Distance from the object, scene units; each view varies it.
-const DISTANCE: f64 = 4.0;
+pub(crate) const DISTANCE: f64 = 4.0;
 const DISTANCE_VARIES: f64 = 0.05;
 /// Roll of the camera, radians.
 const ROLL_VARIES: f64 = 0.10;
 /// Focal length over image width: the object's sphere (radius 1) fills nine tenths of the width.
-const FOCAL: f64 = 1.72;
+pub(crate) const FOCAL: f64 = 1.72;
 /// The principal point, off centre on purpose, as a share of the width and height.
 const PRINCIPAL_POINT: (f64, f64) = (0.4785, 0.5137);
 

@@ -6,6 +6,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use glam::DQuat;
+use ign_geometry::Camera;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
@@ -106,22 +107,37 @@ pub(crate) fn mesh(dir: &Path, surface: &Surface, colors: &[[u8; 3]]) -> Result<
     })
 }
 
-/// The sparse model as text: one camera, all poses, and points with their tracks in the training views.
-pub(crate) fn model(
-    dir: &Path,
+/// Indices of the sparse model's points among the vertices.
+fn points(surface: &Surface) -> Vec<usize> {
+    (0..surface.positions.len()).step_by(POINT_EVERY).collect()
+}
+
+/// Per view, which of the sparse model's points it sees, and where.
+pub(crate) fn observations(
     views: &[DemoView],
     surface: &Surface,
     tracer: &Tracer,
+) -> Vec<Vec<Observation>> {
+    let vertices = points(surface);
+    views
+        .par_iter()
+        .map(|view| observe(view, surface, tracer, &vertices))
+        .collect()
+}
+
+/// Number of a point of the sparse model, and its pixel.
+type Observation = (usize, [f64; 2]);
+
+/// The sparse model as text: one camera, all poses, and points with their tracks in the training views.
+pub(crate) fn model(
+    dir: &Path,
+    (views, poses): (&[DemoView], &[Camera]),
+    seen: &[Vec<Observation>],
+    surface: &Surface,
     colors: &[[u8; 3]],
 ) -> Result<(), DemoError> {
     let sparse = dir.join("sparse/0");
-    let vertices: Vec<usize> = (0..surface.positions.len()).step_by(POINT_EVERY).collect();
-    // Per view: which of the points it sees, and where.
-    let seen: Vec<Vec<(usize, [f64; 2])>> = views
-        .par_iter()
-        .map(|view| observe(view, surface, tracer, &vertices))
-        .collect();
-
+    let vertices = points(surface);
     let mut cameras = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
     let mut images = String::from(
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
@@ -138,8 +154,8 @@ pub(crate) fn model(
                     i.width, i.height, i.fx, i.fy, i.cx, i.cy
                 )?;
             }
-            for (index, (view, seen)) in views.iter().zip(&seen).enumerate() {
-                let pose = view.camera.camera_from_world;
+            for (index, ((view, camera), seen)) in views.iter().zip(poses).zip(seen).enumerate() {
+                let pose = camera.camera_from_world;
                 let (q, t) = (DQuat::from_mat3(&pose.matrix3), pose.translation);
                 let id = index + 1;
                 writeln!(
@@ -191,7 +207,7 @@ fn observe(
     surface: &Surface,
     tracer: &Tracer,
     vertices: &[usize],
-) -> Vec<(usize, [f64; 2])> {
+) -> Vec<Observation> {
     if view.held_out {
         return Vec::new();
     }

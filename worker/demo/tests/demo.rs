@@ -230,6 +230,10 @@ fn occupied_folders_and_bad_options_are_refused() {
             held_out: Some(9),
             ..options()
         },
+        DemoOptions {
+            misregistration: f64::NAN,
+            ..options()
+        },
     ];
     for options in bad {
         let result = generate(&dir.path().join("other"), &options, &|_, _| {});
@@ -277,4 +281,58 @@ fn an_orbit_is_held_out_beside_the_views() {
     };
     let folder = tempfile::tempdir().expect("a folder");
     assert!(generate(&folder.path().join("x"), &pair, &|_, _| {}).is_err());
+}
+
+#[test]
+fn proxy_and_poses_are_off_by_as_much_as_asked_and_the_photographs_are_the_same() {
+    let options = DemoOptions {
+        held_out: Some(1),
+        views: 24,
+        ..options()
+    };
+    let wanted = 2.0;
+    let (_keep_exact, exact) = generated(&options);
+    let (_keep_off, off) = generated(&DemoOptions {
+        misregistration: wanted,
+        ..options
+    });
+    for name in ["images/view_0003.png", "masks/view_0003.png"] {
+        let read = |dir: &Path| fs::read(dir.join(name)).expect("the file");
+        assert_eq!(read(&exact), read(&off), "{name}");
+    }
+    let (exact, off) = (imported(&exact), imported(&off));
+    let rms = |values: &[f64]| {
+        (values.iter().map(|it| it * it).sum::<f64>() / values.len() as f64).sqrt()
+    };
+    // Turned by a half of it about each of two axes across the view.
+    let camera = &exact.views[0].camera;
+    let middle = camera.center() + camera.world_from_camera().matrix3.z_axis * 4.0;
+    let pixel = 4.0 / camera.intrinsics.fx;
+    let shifts: Vec<f64> = exact
+        .views
+        .iter()
+        .zip(&off.views)
+        .map(|(exact, off)| {
+            let at = |camera: &ign_geometry::Camera| camera.project(middle).expect("in front").px;
+            at(&exact.camera).distance(at(&off.camera))
+        })
+        .collect();
+    let across = 2f64.sqrt() * wanted / 2.0;
+    let found = rms(&shifts);
+    assert!(
+        (found / across - 1.0).abs() < 0.3,
+        "{found} px for {across}"
+    );
+    let dents: Vec<f64> = exact
+        .mesh
+        .positions
+        .iter()
+        .zip(&off.mesh.positions)
+        .map(|(exact, off)| exact.distance(*off) / pixel)
+        .collect();
+    let found = rms(&dents);
+    assert!(
+        (found / wanted - 1.0).abs() < 0.3,
+        "{found} px for {wanted}"
+    );
 }
