@@ -393,16 +393,6 @@ impl Store for SqlStore {
         let limit = i64::from(limit.min(MAX_PAGE));
         let mut reader = self.backend.reader().acquire().await?;
         let now = Backend::now(&mut reader).await?;
-        let counted = collection.map_or(Counted::All, Counted::Of);
-        let queues = all_queues(&mut reader, counted).await?;
-        let mut counts: BTreeMap<JobState, u64> =
-            JobState::ALL.into_iter().map(|state| (state, 0)).collect();
-        let shown = |name: &CollectionId| collection.is_none_or(|only| only == name);
-        for (_, queue) in queues.iter().filter(|(name, _)| shown(name)) {
-            for (state, jobs) in &queue.by_state {
-                *counts.entry(*state).or_default() += jobs;
-            }
-        }
         let mut some = async |state, order| {
             let mut query = select_jobs(collection, state);
             query
@@ -415,6 +405,17 @@ impl Store for SqlStore {
         let running = some(JobState::Leased, "started_at, id").await?;
         let recent_failures = some(JobState::Failed, "finished_at desc, id").await?;
         let queued = some(JobState::Queued, "priority desc, submitted_at, id").await?;
+        // After the list: every job in it has its queue then.
+        let counted = collection.map_or(Counted::All, Counted::Of);
+        let queues = all_queues(&mut reader, counted).await?;
+        let mut counts: BTreeMap<JobState, u64> =
+            JobState::ALL.into_iter().map(|state| (state, 0)).collect();
+        let shown = |name: &CollectionId| collection.is_none_or(|only| only == name);
+        for (_, queue) in queues.iter().filter(|(name, _)| shown(name)) {
+            for (state, jobs) in &queue.by_state {
+                *counts.entry(*state).or_default() += jobs;
+            }
+        }
         let ready = ready_workers(&mut reader, self.settings.lease, now).await?;
         let waiting = all_waiting(&mut reader, &queued, &queues, ready, now).await?;
         let workers = list_workers(&mut reader, now).await?;

@@ -10,7 +10,7 @@ use super::super::{Connection, Db, from_key, key, to_db};
 use super::CHUNK;
 use super::rows::{collection_from, count, internal, parse};
 use crate::state::{Job, JobState};
-use crate::store::{Collection, Result, Waiting};
+use crate::store::{Collection, Result, StoreError, Waiting};
 use crate::waiting::{Rival, Surroundings, describe};
 
 /// A collection and how many jobs are in it.
@@ -37,23 +37,6 @@ pub(super) async fn all_queues(
     reader: &mut Connection,
     counted: Counted<'_>,
 ) -> Result<BTreeMap<CollectionId, QueueCounts>> {
-    let rows = sqlx::query(
-        "select c.*, (select count(*) from jobs j where j.collection = c.name and j.state = 'leased') as running \
-         from collections c",
-    )
-    .fetch_all(&mut *reader)
-    .await?;
-    let mut queues = BTreeMap::new();
-    for row in rows {
-        let collection = collection_from(&row)?;
-        let counts = QueueCounts {
-            running: count(row.try_get("running")?),
-            by_priority: BTreeMap::new(),
-            by_state: BTreeMap::new(),
-            collection,
-        };
-        queues.insert(counts.collection.name.clone(), counts);
-    }
     let mut query =
         QueryBuilder::<Db>::new("select collection, priority, state, count(*) as jobs from jobs");
     match counted {
@@ -66,11 +49,29 @@ pub(super) async fn all_queues(
         Counted::All => {}
     }
     query.push(" group by collection, priority, state");
-    for row in query.build().fetch_all(reader).await? {
-        let name: CollectionId = parse(row.try_get("collection")?)?;
-        let Some(queue) = queues.get_mut(&name) else {
-            continue;
+    let counts = query.build().fetch_all(&mut *reader).await?;
+    // After the jobs: theirs are all there then.
+    let rows = sqlx::query(
+        "select c.*, (select count(*) from jobs j where j.collection = c.name and j.state = 'leased') as running \
+         from collections c",
+    )
+    .fetch_all(reader)
+    .await?;
+    let mut queues = BTreeMap::new();
+    for row in rows {
+        let queue = QueueCounts {
+            running: count(row.try_get("running")?),
+            by_priority: BTreeMap::new(),
+            by_state: BTreeMap::new(),
+            collection: collection_from(&row)?,
         };
+        queues.insert(queue.collection.name.clone(), queue);
+    }
+    for row in counts {
+        let name: CollectionId = parse(row.try_get("collection")?)?;
+        let queue = queues
+            .get_mut(&name)
+            .ok_or_else(|| missing_collection(&name))?;
         let jobs = count(row.try_get("jobs")?);
         let state = parse(row.try_get("state")?)?;
         if state == JobState::Queued {
@@ -79,6 +80,10 @@ pub(super) async fn all_queues(
         *queue.by_state.entry(state).or_default() += jobs;
     }
     Ok(queues)
+}
+
+fn missing_collection(name: &CollectionId) -> StoreError {
+    internal(format!("a job's collection {name} is missing"))
 }
 
 /// Where a job stands among the queued ones.
@@ -154,9 +159,7 @@ pub(super) async fn all_waiting(
                 return Ok(nothing());
             };
             let name = &job.spec.object.collection;
-            let own = queues
-                .get(name)
-                .ok_or_else(|| internal(format!("a job's collection {name} is missing")))?;
+            let own = queues.get(name).ok_or_else(|| missing_collection(name))?;
             let higher = |queue: &QueueCounts| -> u64 {
                 let from = i64::from(job.spec.priority) + 1;
                 queue.by_priority.range(from..).map(|(_, jobs)| jobs).sum()
