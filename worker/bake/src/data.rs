@@ -393,7 +393,7 @@ impl<'a> Dataset<'a> {
 }
 
 /// At most `most` of all, evenly spread.
-fn spread(all: &[usize], most: usize) -> Vec<usize> {
+pub(crate) fn spread(all: &[usize], most: usize) -> Vec<usize> {
     let kept = all.len().min(most);
     (0..kept).map(|at| all[at * all.len() / kept]).collect()
 }

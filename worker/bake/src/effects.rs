@@ -15,7 +15,7 @@ use tch::{Device, Kind, Tensor};
 
 use crate::BakeError;
 use crate::checkpoint::{Session, Stage, Watch};
-use crate::data::Dataset;
+use crate::data::{Dataset, spread};
 use crate::sampler::{indices, step_rng};
 use crate::schedule::{Rate, Schedule};
 
@@ -23,6 +23,10 @@ use crate::schedule::{Rate, Schedule};
 const POINT_RATE: f64 = 2e-3;
 /// Surface observations kept at most; more views thin them out evenly.
 const MOST_OBSERVATIONS: usize = 4_000_000;
+/// Bytes of the pictures and depths that these are compared with, at most; more views are thinned out evenly.
+const MOST_SOURCE_BYTES: usize = 2 << 30;
+/// Bytes of a pixel of these: depth, colour, coverage.
+const SOURCE_PIXEL_BYTES: usize = 8;
 
 /// Name and length of one training.
 pub(crate) struct Plan<'a> {
@@ -40,8 +44,23 @@ pub(crate) struct Plan<'a> {
     pub(crate) validation: &'a dyn Fn(Effects) -> Option<f64>,
 }
 
-/// Every surface point that a training view sees.
-fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
+/// The training views that are learned from.
+fn observed_views(data: &Dataset<'_>) -> Vec<usize> {
+    let sizes = data.train.iter().map(|&view| {
+        let i = data.cameras(view, data.reference_scale).0.intrinsics;
+        (i.width as usize, i.height as usize)
+    });
+    let (width, height) = sizes.fold((1, 1), |a, b| (a.0.max(b.0), a.1.max(b.1)));
+    spread(&data.train, views_that_fit(width * height))
+}
+
+/// How many views of so many pixels each.
+fn views_that_fit(pixels: usize) -> usize {
+    (MOST_SOURCE_BYTES / SOURCE_PIXEL_BYTES / pixels.max(1)).max(2)
+}
+
+/// Every surface point that one of these views sees.
+fn observe_all(data: &Dataset<'_>, views: &[usize]) -> Result<Observations, BakeError> {
     struct One {
         camera: ign_geometry::Camera,
         points: Vec<f32>,
@@ -51,9 +70,8 @@ fn observe_all(data: &Dataset<'_>) -> Result<Observations, BakeError> {
         rgb: Vec<u8>,
         alpha: Vec<u8>,
     }
-    let per_view = MOST_OBSERVATIONS / data.train.len().max(1);
-    let views: Vec<One> = data
-        .train
+    let per_view = MOST_OBSERVATIONS / views.len().max(1);
+    let views: Vec<One> = views
         .par_iter()
         .map(|&view| {
             let straight = data.straight(view, data.reference_scale)?;
@@ -188,9 +206,10 @@ pub(crate) fn train_points(
 ) -> Result<(), BakeError> {
     let (seed, batch) = (plan.seed, plan.batch);
     let before = session.reporter.activity("observations");
-    let observations = observe_all(data)?;
+    let views = observed_views(data);
+    let observations = observe_all(data, &views)?;
     let points = observations.points.size()[0];
-    let views = data.train.len() as i64;
+    let views = views.len() as i64;
     session.reporter.activity(before);
     let mut builder = Builder::new();
     let net = PointEffects::new(&mut builder);
@@ -301,4 +320,30 @@ pub(crate) fn train_paper(
         };
         steps::effects_step(&net, &mut trainees[0], &pair, steps::RATE * rate)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_that_are_learned_from_fit_into_their_memory() {
+        for side in [64, 512, 2048, 8192] {
+            let views = views_that_fit(side * side);
+            let bytes = views * side * side * SOURCE_PIXEL_BYTES;
+            assert!(
+                views == 2 || bytes <= MOST_SOURCE_BYTES,
+                "{side} px: {views} views"
+            );
+            assert!(views >= 2);
+        }
+        assert_eq!(views_that_fit(1024 * 1024), 256);
+        let all: Vec<usize> = (0..920).collect();
+        let kept = spread(&all, views_that_fit(1024 * 1024));
+        assert_eq!((kept.len(), kept[0]), (256, 0));
+        assert!(
+            kept.windows(2)
+                .all(|pair| (3..=4).contains(&(pair[1] - pair[0])))
+        );
+    }
 }
