@@ -1164,12 +1164,26 @@ pub(crate) async fn aliases_and_retirement(bench: &Bench) {
     );
     let retired = bench.store.version(&vase, "v3").await.unwrap();
     assert!(retired.retired && retired.retired_at.is_some());
+    let standing = bench.store.standing(&vase).await.unwrap();
+    assert_eq!(standing.newest, 3);
+    let aliases: Vec<_> = standing
+        .aliases
+        .iter()
+        .map(|(a, v)| (a.as_str(), *v))
+        .collect();
+    assert_eq!(aliases, [("approved", 2), ("latest", 2)]);
+    assert_eq!(standing.retired, [(3, retired.retired_at)].into());
     // A repeated call does not prolong the grace.
     let again = bench.store.retire(&vase, "v3").await.unwrap();
     assert_eq!(again, retired);
     let restored = bench.store.restore(&vase, "v3").await.unwrap();
     assert_eq!((restored.retired, restored.retired_at), (false, None));
     assert_eq!(restored.aliases, ["latest"]);
+    let standing = bench.store.standing(&vase).await.unwrap();
+    assert_eq!((standing.newest, standing.retired), (3, [].into()));
+    assert_eq!(standing.aliases["latest"], 3);
+    let nothing = bench.store.standing(&name("museum/none")).await.unwrap();
+    assert_eq!(nothing, ign_queue::Standing::default());
     assert_eq!(
         bench.store.restore(&vase, "v3").await.unwrap(),
         restored,
