@@ -6,7 +6,9 @@
 //! alone, with seeds that nothing else uses. Training starts there if they blend better than plain blending on the object's
 //! validation views; `start=plain` does without. The measured effect is in the README here.
 
+use std::fs::Permissions;
 use std::io::Write as _;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
 use ign_bundle::weights::{self, Precision};
@@ -69,8 +71,10 @@ pub fn pretrain(job: &PretrainJob, events: &dyn Fn(Event)) -> Result<(), BakeErr
     let work = tempfile::tempdir().map_err(io(&std::env::temp_dir()))?;
     // Beside its place: a place that cannot be written shows before the training, and what is there stays until its end.
     let folder = job.out.parent().filter(|it| !it.as_os_str().is_empty());
-    let mut file =
-        tempfile::NamedTempFile::new_in(folder.unwrap_or(Path::new("."))).map_err(io(&job.out))?;
+    let mut file = tempfile::Builder::new()
+        .permissions(Permissions::from_mode(0o666))
+        .tempfile_in(folder.unwrap_or(Path::new(".")))
+        .map_err(io(&job.out))?;
     let open = |name: &str| {
         let dir = work.path().join(name);
         Session::open(&reporter, &dir, f64::INFINITY, &job.recipe, name, None)

@@ -7,6 +7,7 @@ mod gains;
 mod hard;
 
 use std::cell::RefCell;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
 use ign_bake::{BakeJob, Event, PretrainJob, Recipe, bake, pretrain};
@@ -184,6 +185,13 @@ fn pretraining_writes_weights_of_the_network_that_was_asked_for() {
     let tensors = ign_bundle::weights::decode("first", &bytes).expect("weights");
     let shape = |name: &str| tensors.get(name).map(|tensor| tensor.shape.clone());
     assert_eq!(shape("composition.stem.weight"), Some(vec![8, 33, 3, 3]));
+    // Others may read it, as any file that is made here.
+    std::fs::write(dir.path().join("any"), []).expect("a file");
+    let mode = |name: &str| {
+        let data = std::fs::metadata(dir.path().join(name)).expect("a file");
+        data.permissions().mode()
+    };
+    assert_eq!(mode("first"), mode("any"));
     // It learned: the head starts at zero.
     let head = &tensors["composition.head.weight"].values;
     assert!(head.iter().any(|value| *value != 0.0));
