@@ -70,7 +70,7 @@ NETWORKS = [
         "train": "EffectsNet of preset standard, 8192 pairs", "render": "EffectsNet of preset standard, a point a pixel",
     }, 60, 20),
     *network("blend", "blend", {
-        "train": "CompositionNet of preset standard, 4 windows of 64 px", "render": "CompositionNet of preset standard",
+        "train": "CompositionNet of preset standard, 8 windows of 32 px", "render": "CompositionNet of preset standard",
     }, 20, 20),
 ]
 

@@ -10,8 +10,10 @@
 //! 7.78, left out 6.14 and 7.47, both 6.07 and 7.33 (plain blending 8.38 and 11.07).
 //!
 //! Deviation (presets `standard` and `auto`): random windows instead of whole images, so that a step sees several views and the
-//! network cannot rely on framing; l1 plus a squared term, since squared error is what is scored; no discriminator
-//! (it is two thirds of a step's cost, and lowers no error that is scored). The preset `paper` has the paper's.
+//! network cannot rely on framing. Many small ones teach more in the same time: held-out error after 1650 steps of eight windows
+//! of 32 px and after 1000 of four of 64 px, demo vases at 64 px, 5.86 and 6.00 (matte), 10.73 and 10.92 (glossy). l1 plus a
+//! squared term, since squared error is what is scored; no discriminator (it is two thirds of a step's cost, and lowers no error
+//! that is scored). The preset `paper` has the paper's.
 
 use ign_nets::composition::{BlendComposition, BlendInput, PaperComposition};
 use ign_nets::losses;

@@ -28,8 +28,8 @@ const IMAGE_PX: i64 = 128;
 /// Side of the frames.
 const FRAME_PX: i64 = 256;
 /// Windows of the blending head and their side; pairs of the point effects: what a bake takes.
-const WINDOWS: i64 = 4;
-const WINDOW_PX: i64 = 64;
+const WINDOWS: i64 = 8;
+const WINDOW_PX: i64 = 32;
 const PAIRS: i64 = 8192;
 const AVERAGE_DECAY: f64 = 0.995;
 /// Surface points of a Siamese pair.

@@ -70,11 +70,15 @@ impl PointEffects {
                     } else {
                         (Init::kaiming(from), Init::Constant(0.0))
                     };
-                    b.scope(&format!("layer{index}"), |b| {
+                    let layer = |b: &mut Builder| {
                         (
                             b.param("weight", &[to, from], init),
                             b.param("bias", &[to], bias),
                         )
+                    };
+                    b.scope(&format!("layer{index}"), |b| {
+                        // What goes into softplus is about -4: a rounding to bfloat16 shows.
+                        if last { b.exact(layer) } else { layer(b) }
                     })
                 })
                 .collect()
@@ -83,7 +87,7 @@ impl PointEffects {
     }
 
     /// `points`, `normals`, `to_viewer`: [P, 3] in the normalised frame, the latter two unit -> effects [P, 3], linear
-    /// light, not negative. Layers compute in the kind of `params`.
+    /// light, not negative. Layers compute in the kind of their weights.
     pub fn forward(
         &self,
         params: &Params,
@@ -101,10 +105,12 @@ impl PointEffects {
                 cosine,
             ],
             1,
-        )
-        .to_kind(params.kind());
+        );
         for (index, (weight, bias)) in self.layers.iter().enumerate() {
-            x = x.linear(params.get(*weight), Some(params.get(*bias)));
+            let weight = params.get(*weight);
+            x = x
+                .to_kind(weight.kind())
+                .linear(weight, Some(params.get(*bias)));
             if index + 1 < self.layers.len() {
                 x = x.relu();
             }

@@ -143,25 +143,34 @@ fn a_bundle_that_cannot_be_so_small_is_refused_before_training() {
     }
 }
 
+/// In the mean of several seeds: two trainings that round differently go different ways, in either precision.
 #[test]
 fn training_in_bfloat16_costs_no_twentieth_of_a_decibel() {
+    const SEEDS: u64 = 3;
     let dir = tempfile::tempdir().expect("a folder");
     let dir = dir.path();
     let capture = capture(dir, 0.8);
-    let psnr = |precision: &str| {
-        let recipe = recipe(&[
-            ("precision", precision),
-            ("effects", "on"),
-            ("effects_steps", "120"),
-            ("composition_steps", "60"),
-        ]);
-        let bundle = bake(&job(&capture, &dir.join(precision), recipe), &|_| {}).expect("a bake");
+    let psnr = |precision: &str, seed: u64| {
+        let recipe = Recipe {
+            seed,
+            ..recipe(&[
+                ("precision", precision),
+                ("effects", "on"),
+                ("effects_steps", "300"),
+                ("composition_steps", "20"),
+            ])
+        };
+        let work = dir.join(format!("{precision}-{seed}"));
+        let bundle = bake(&job(&capture, &work, recipe), &|_| {}).expect("a bake");
         let metrics = Bundle::open(&bundle).expect("it verifies").metrics();
         let metrics = metrics.expect("metrics").expect("metrics.json");
         metrics.method("ours").expect("a row").psnr
     };
-    let (single, half) = (psnr("fp32"), psnr("bf16"));
-    assert!(half > single - 0.05, "{single} and {half} dB");
+    let gains: Vec<f64> = (0..SEEDS)
+        .map(|seed| psnr("bf16", seed) - psnr("fp32", seed))
+        .collect();
+    let mean = gains.iter().sum::<f64>() / SEEDS as f64;
+    assert!(mean > -0.05, "{gains:?} dB");
     // Not the same numbers: the setting does something.
-    assert!(single.to_bits() != half.to_bits());
+    assert!(gains.iter().all(|gain| *gain != 0.0));
 }
