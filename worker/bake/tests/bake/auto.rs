@@ -157,7 +157,7 @@ fn training_in_bfloat16_costs_no_twentieth_of_a_decibel() {
                 ("precision", precision),
                 ("effects", "on"),
                 ("effects_steps", "300"),
-                ("composition_steps", "20"),
+                ("composition_steps", "60"),
             ])
         };
         let work = dir.join(format!("{precision}-{seed}"));
