@@ -86,7 +86,7 @@ pretrain: build
 		fi; \
 	done; done; done; \
 	"$$bin/ign-worker" pretrain "$$out"/*-1* --out worker/bake/pretrained/composition.safetensors --size 96 \
-		--set effects_steps=300 --set composition_steps=12000 --set patch=64 --set batch=4 $(ARGS)
+		--set effects_steps=300 --set composition_steps=12000 --set patch=64 --set batch=4 --set optimizer=adam $(ARGS)
 
 bench:
 	python3 tests/bench/run.py $(BENCH) $(ARGS)

@@ -144,8 +144,8 @@ pub struct JobPage {
     pub next: Option<JobId>,
 }
 
-/// Why a queued job is not leased yet.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// Why a queued job is not leased yet; of one that is not queued, the default.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Waiting {
     /// Estimate of the jobs that are leased before it: those of its own collection, and the share of the others.
     pub position: u64,

@@ -31,10 +31,7 @@ pub(crate) struct Rival {
 
 pub(crate) fn describe(job: &Job, around: &Surroundings) -> Waiting {
     if job.state != JobState::Queued {
-        return Waiting {
-            position: 0,
-            reason: String::new(),
-        };
+        return Waiting::default();
     }
     Waiting {
         position: position(around),

@@ -7,7 +7,7 @@
 
 use ign_bundle::metrics::SpeedError;
 use ign_events::Event;
-use ign_nets::optim::{AdamState, Trainee};
+use ign_nets::optim::{OptimizerState, Trainee};
 use ign_nets::params::{Builder, Params, flat_values};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
@@ -106,7 +106,7 @@ pub(crate) struct Session<'a> {
 #[derive(Clone)]
 struct Snapshot {
     flat: Vec<Vec<f32>>,
-    adam: Vec<AdamState>,
+    optimizers: Vec<OptimizerState>,
     best: Option<Vec<f32>>,
 }
 
@@ -117,15 +117,15 @@ impl Snapshot {
                 .iter()
                 .map(|t| flat_values(t.params.flat()))
                 .collect(),
-            adam: trainees.iter().map(|t| t.adam.state()).collect(),
+            optimizers: trainees.iter().map(|t| t.optimizer.state()).collect(),
             best: best.cloned(),
         }
     }
 
     fn restore(&self, trainees: &mut [Trainee]) -> Result<(), BakeError> {
-        for ((trainee, flat), adam) in trainees.iter_mut().zip(&self.flat).zip(&self.adam) {
+        for ((trainee, flat), state) in trainees.iter_mut().zip(&self.flat).zip(&self.optimizers) {
             trainee.params.restore(flat)?;
-            trainee.adam.restore(adam)?;
+            trainee.optimizer.restore(state)?;
         }
         Ok(())
     }
@@ -300,7 +300,7 @@ impl<'a> Session<'a> {
             if schedule.is_due(&current.course, current.step, progress) {
                 let pause = Instant::now();
                 self.reporter.activity("watching");
-                let averaged = trainees[0].adam.averaged(&trainees[0].params);
+                let averaged = trainees[0].optimizer.averaged(&trainees[0].params);
                 let watch = stage.watch.as_ref();
                 let error = watch.and_then(|watch| (watch.validation)(&averaged));
                 if let Some(watch) = watch {
@@ -374,8 +374,8 @@ impl<'a> Session<'a> {
                 "{name}: {skipped} steps had gradients that were not finite and were left out"
             ));
         }
-        let Trainee { params, adam } = &trainees[0];
-        let averaged = adam.averaged(params);
+        let Trainee { params, optimizer } = &trainees[0];
+        let averaged = optimizer.averaged(params);
         if let Some(best) = &best {
             averaged.restore(best)?;
         }
@@ -445,17 +445,22 @@ impl<'a> Session<'a> {
         }
         if let Some((current, snapshot)) = current {
             let mut current = current.clone();
-            current.adam_steps = snapshot.adam.iter().map(|state| state.steps).collect();
+            current.adam_steps = snapshot
+                .optimizers
+                .iter()
+                .map(|state| state.steps)
+                .collect();
             meta.current = Some(current);
             if let Some(best) = &snapshot.best {
                 tensors.push(("current/best".into(), vec![best.len()], bytes(best)));
             }
-            for (index, (flat, adam)) in snapshot.flat.iter().zip(&snapshot.adam).enumerate() {
+            for (index, (flat, state)) in snapshot.flat.iter().zip(&snapshot.optimizers).enumerate()
+            {
                 for (name, values) in [
                     ("flat", flat),
-                    ("first", &adam.first),
-                    ("second", &adam.second),
-                    ("average", &adam.average),
+                    ("first", &state.first),
+                    ("second", &state.second),
+                    ("average", &state.average),
                 ] {
                     tensors.push((
                         format!("current/{index}/{name}"),
@@ -575,7 +580,7 @@ pub(crate) fn parse(data: &[u8]) -> Result<Stored, String> {
             };
             let mut snapshot = Snapshot {
                 flat: Vec::new(),
-                adam: Vec::new(),
+                optimizers: Vec::new(),
                 best: None,
             };
             if file.names().contains(&"current/best") {
@@ -583,7 +588,7 @@ pub(crate) fn parse(data: &[u8]) -> Result<Stored, String> {
             }
             for (index, &steps) in current.adam_steps.iter().enumerate() {
                 snapshot.flat.push(part(index, "flat")?);
-                snapshot.adam.push(AdamState {
+                snapshot.optimizers.push(OptimizerState {
                     first: part(index, "first")?,
                     second: part(index, "second")?,
                     average: part(index, "average")?,
@@ -619,7 +624,10 @@ impl Current {
 
 /// Steps whose gradient was not finite.
 fn skipped_steps(trainees: &[Trainee]) -> u64 {
-    trainees.iter().map(|trainee| trainee.adam.skipped()).sum()
+    trainees
+        .iter()
+        .map(|trainee| trainee.optimizer.skipped())
+        .sum()
 }
 
 fn unusable(path: &Path, reason: &dyn std::fmt::Display) -> BakeError {
@@ -730,8 +738,8 @@ mod tests {
     /// Steps move the weights past Adam, whose average follows by itself: one step of it with no gradient.
     fn step(trainees: &mut [Trainee], rate: f64) -> f64 {
         let loss = descend(&trainees[0], rate);
-        let Trainee { params, adam } = &mut trainees[0];
-        assert!(adam.step(params, &params.flat().zeros_like(), 0.0, 1.0));
+        let Trainee { params, optimizer } = &mut trainees[0];
+        assert!(optimizer.step(params, &params.flat().zeros_like(), 0.0, 1.0));
         loss
     }
 

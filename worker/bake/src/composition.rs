@@ -256,7 +256,7 @@ pub(crate) fn train_blend(
             }),
         }),
     };
-    let trainee = Trainee::new(params, settings.average_decay);
+    let trainee = settings.trainee(params);
     session.train(&stage, vec![trainee], |trainees, step, rate| {
         let mut rng = step_rng(plan.seed, plan.stage, step);
         train_on_windows(&net, &mut trainees[0], &examples, settings, &mut rng, rate)

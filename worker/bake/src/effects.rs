@@ -16,6 +16,7 @@ use tch::{Device, Kind, Tensor};
 use crate::BakeError;
 use crate::checkpoint::{Session, Stage, Watch};
 use crate::data::{Dataset, spread};
+use crate::recipe::Settings;
 use crate::sampler::{indices, step_rng};
 use crate::schedule::{Rate, Schedule};
 
@@ -34,12 +35,7 @@ pub(crate) struct Plan<'a> {
     pub(crate) stage: &'static str,
     pub(crate) schedule: Schedule,
     pub(crate) seed: u64,
-    /// Observations per step of the point effects.
-    pub(crate) batch: i64,
-    /// Decay of the average of weights that is kept.
-    pub(crate) average_decay: f64,
-    /// What layers of the point effects compute in.
-    pub(crate) kind: Kind,
+    pub(crate) settings: &'a Settings,
     /// Error on the validation views with these effects; `None` when there are no such views.
     pub(crate) validation: &'a dyn Fn(Effects) -> Option<f64>,
 }
@@ -204,7 +200,7 @@ pub(crate) fn train_points(
     session: &mut Session<'_>,
     plan: &Plan<'_>,
 ) -> Result<(), BakeError> {
-    let (seed, batch) = (plan.seed, plan.batch);
+    let (seed, batch) = (plan.seed, plan.settings.effects_batch);
     let before = session.reporter.activity("observations");
     let views = observed_views(data);
     let observations = observe_all(data, &views)?;
@@ -213,7 +209,7 @@ pub(crate) fn train_points(
     session.reporter.activity(before);
     let mut builder = Builder::new();
     let net = PointEffects::new(&mut builder);
-    let trainee = Trainee::new(builder.build(data.device, seed), plan.average_decay);
+    let trainee = plan.settings.trainee(builder.build(data.device, seed));
     let validation = |params: &Params| {
         let effects = Effects::Points(net.clone(), params.in_kind(Kind::Float));
         (plan.validation)(effects)
@@ -236,7 +232,7 @@ pub(crate) fn train_points(
         let other = indices(&mut rng, batch, views, data.device);
         let descent = Descent {
             rate: POINT_RATE * rate,
-            kind: plan.kind,
+            kind: plan.settings.kind(),
         };
         steps::point_step(&net, trainee, &observations, (&pick, &other), descent)
     })
@@ -296,7 +292,7 @@ pub(crate) fn train_paper(
     let mut builder = Builder::new();
     let net = PaperEffects::new(&mut builder);
     let params = builder.build(data.device, plan.seed);
-    let trainee = Trainee::new(params, plan.average_decay);
+    let trainee = Trainee::new(params, plan.settings.average_decay);
     let stage = Stage {
         name: plan.stage,
         schedule: plan.schedule,

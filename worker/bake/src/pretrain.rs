@@ -14,7 +14,6 @@ use std::path::{Path, PathBuf};
 use ign_bundle::weights::{self, Precision};
 use ign_capture::{Gains, ImportOptions};
 use ign_nets::composition::BlendComposition;
-use ign_nets::optim::Trainee;
 use ign_nets::{Builder, NetError, Params};
 use ign_render::{Composition, NetworkFiles};
 use rand::RngExt as _;
@@ -112,10 +111,7 @@ pub fn pretrain(job: &PretrainJob, events: &dyn Fn(Event)) -> Result<(), BakeErr
     let settings = job.recipe.resolve(1)?;
     let mut builder = Builder::new();
     let net = BlendComposition::new(&mut builder, settings.k, settings.width);
-    let trainee = Trainee::new(
-        builder.build(device, job.recipe.seed),
-        settings.average_decay,
-    );
+    let trainee = settings.trainee(builder.build(device, job.recipe.seed));
     let stage = Stage {
         name: OURS.composition,
         schedule: Schedule {

@@ -1,6 +1,8 @@
 //! The recipe: what a job asks for. Submitted as JSON, stored in the bundle as submitted.
 
+use ign_nets::Params;
 use ign_nets::composition::{BLEND_WIDTH, BLEND_WIDTHS};
+use ign_nets::optim::Trainee;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use tch::Kind;
@@ -239,6 +241,8 @@ pub(crate) struct Settings {
     pub(crate) shuffle: bool,
     /// Whether the painting head is trained against a discriminator.
     pub(crate) adversarial: bool,
+    /// Whether matrices within the networks of preset `standard` learn by Muon, not Adam.
+    pub(crate) muon: bool,
     /// Decay of the average of weights that is kept; 0: the last weights are.
     pub(crate) average_decay: f64,
     /// Whether the learning rate stays the same to the end.
@@ -328,6 +332,7 @@ impl Recipe {
             leave_out: !paper,
             shuffle: !paper,
             adversarial: true,
+            muon: !paper,
             average_decay: if paper { 0.0 } else { 0.995 },
             constant_rate: paper,
             effects_steps: if paper { epochs(64) } else { 2000 },
@@ -381,6 +386,15 @@ impl Settings {
             Kind::BFloat16
         } else {
             Kind::Float
+        }
+    }
+
+    /// A network of preset `standard` at the start of its training.
+    pub(crate) fn trainee(&self, params: Params) -> Trainee {
+        if self.muon {
+            Trainee::with_muon(params, self.average_decay)
+        } else {
+            Trainee::new(params, self.average_decay)
         }
     }
 
@@ -469,6 +483,9 @@ impl Settings {
             "leave_out" => self.leave_out = switch(key, value)?,
             "shuffle" => self.shuffle = switch(key, value)?,
             "adversarial" => self.adversarial = switch(key, value)?,
+            "optimizer" => {
+                self.muon = choice(key, value, &[("muon", true), ("adam", false)])?;
+            }
             "average_decay" => self.average_decay = number(key, value, 0.0, 0.999_999)?,
             "rate" => {
                 self.constant_rate = choice(key, value, &[("constant", true), ("falling", false)])?;
@@ -505,7 +522,7 @@ impl Settings {
             _ => {
                 return Err(invalid(
                     format!("setting {key} is unknown"),
-                    "known: k, train_views, references, supersample, drawing, effects, effects_net, head, loss, leave_out, shuffle, precision, adversarial, \
+                    "known: k, train_views, references, supersample, drawing, effects, effects_net, head, loss, leave_out, shuffle, precision, adversarial, optimizer, \
                      average_decay, rate, effects_steps, effects_batch, composition_steps, \
                      start, width, batch, patch, methods, half_weights, cache_mb, checkpoint_secs, margin, gains, fit, simplify, preview_frames, quality, \
                      target_psnr, max_secs, max_bundle_mb, min_render_fps",

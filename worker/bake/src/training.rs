@@ -255,9 +255,7 @@ impl Trainer<'_> {
                 stage: names.effects,
                 schedule,
                 seed: self.seed,
-                batch: settings.effects_batch,
-                average_decay: settings.average_decay,
-                kind: settings.kind(),
+                settings,
                 validation: &|effects| {
                     let model = watched.take().unwrap_or_else(|| self.drawn.plain(data));
                     let model = model.with_effects(Some(effects));

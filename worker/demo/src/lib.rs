@@ -252,7 +252,7 @@ pub fn generate(
     options.check()?;
     let staging = Staging::beside(out)?;
 
-    let surface = Surface::new(options.shape);
+    let surface = Surface::new(options.shape, options.size);
     let paint = Paint::new(options.shape, options.seed);
     let tracer = Tracer::new(&surface);
     let lighting = Lighting::bake(&surface, &tracer);

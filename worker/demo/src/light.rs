@@ -107,7 +107,7 @@ impl Gloss {
 
 impl Lighting {
     pub(crate) fn bake(surface: &Surface, tracer: &Tracer) -> Self {
-        let map_rows = (Surface::row_count() - 1) * ROWS_PER_ROW + 1;
+        let map_rows = (surface.row_count() - 1) * ROWS_PER_ROW + 1;
         let visibility = (0..map_rows * COLUMNS)
             .into_par_iter()
             .map(|texel| {
@@ -118,7 +118,7 @@ impl Lighting {
                 [0, 1].map(|light| visible_share(&LIGHTS[light], surface, tracer, place, normal))
             })
             .collect();
-        let dome = (0..Surface::row_count())
+        let dome = (0..surface.row_count())
             .into_par_iter()
             .map(|row| {
                 let (position, normal) = surface.at(row as f64, 0.0);

@@ -11,9 +11,13 @@ use glam::{DVec2, DVec3};
 
 use crate::Shape;
 
-/// Grid of the mesh: 2 * 176 * (148 - 1) triangles, less at the poles.
+/// Grid of the finest mesh: 2 * 176 * (148 - 1) triangles, less at the poles.
 const COLUMNS: usize = 176;
 const ROWS: usize = 148;
+/// Size of the images from which on the mesh is the finest: in smaller ones its triangles would be far below a pixel.
+const FINEST_PX: f64 = 96.0;
+/// The coarsest mesh, as a share of the finest one's rows and columns.
+const COARSEST: f64 = 0.3;
 
 /// Where the object stands in the world: nothing may rely on it being centred.
 const CENTER: DVec3 = DVec3::new(0.25, -0.4, 0.6);
@@ -31,11 +35,12 @@ pub(crate) struct Surface {
     pub(crate) positions: Vec<DVec3>,
     /// Unit normals of the smooth surface.
     pub(crate) normals: Vec<DVec3>,
-    /// Row coordinate of each vertex, 0 to `ROWS - 1`.
+    /// Row coordinate of each vertex, from 0 on.
     pub(crate) rows: Vec<f64>,
     /// Counter-clockwise seen from outside.
     pub(crate) triangles: Vec<[u32; 3]>,
     profile: Vec<ProfileRow>,
+    columns: usize,
     /// Row coordinate of the rim: rows beyond are the inside. Infinite for closed shapes.
     pub(crate) rim_row: f64,
 }
@@ -48,30 +53,36 @@ struct ProfileRow {
 }
 
 impl Surface {
-    pub(crate) fn new(shape: Shape) -> Self {
+    /// As fine as images of `size` pixels show.
+    pub(crate) fn new(shape: Shape, size: u32) -> Self {
+        let detail = (f64::from(size) / FINEST_PX).clamp(COARSEST, 1.0);
+        let of = |finest: usize| (finest as f64 * detail).round() as usize;
+        let (rows, columns) = (of(ROWS), of(COLUMNS));
         let (controls, rim) = controls(shape);
-        let (profile, rim_row) = rows_along(&controls, rim);
+        let (profile, rim_row) = rows_along(&controls, rim, rows);
         let mut surface = Self {
             center: CENTER,
-            positions: Vec::with_capacity(ROWS * COLUMNS),
-            normals: Vec::with_capacity(ROWS * COLUMNS),
-            rows: Vec::with_capacity(ROWS * COLUMNS),
-            triangles: Vec::with_capacity(2 * ROWS * COLUMNS),
+            positions: Vec::with_capacity(rows * columns),
+            normals: Vec::with_capacity(rows * columns),
+            rows: Vec::with_capacity(rows * columns),
+            triangles: Vec::with_capacity(2 * rows * columns),
             profile,
+            columns,
             rim_row,
         };
         surface.tessellate();
         surface
     }
 
-    pub(crate) fn row_count() -> usize {
-        ROWS
+    pub(crate) fn row_count(&self) -> usize {
+        self.profile.len()
     }
 
     /// Smooth point and normal at a row coordinate and an angle, in the world.
     pub(crate) fn at(&self, row: f64, angle: f64) -> (DVec3, DVec3) {
-        let row = row.clamp(0.0, (ROWS - 1) as f64);
-        let low = (row as usize).min(ROWS - 2);
+        let rows = self.row_count();
+        let row = row.clamp(0.0, (rows - 1) as f64);
+        let low = (row as usize).min(rows - 2);
         let (a, b) = (self.profile[low], self.profile[low + 1]);
         let share = row - low as f64;
         let normal = a.normal.lerp(b.normal, share).normalize_or(a.normal);
@@ -82,13 +93,13 @@ impl Surface {
     }
 
     fn tessellate(&mut self) {
-        let last = ROWS - 1;
-        let mut first_of_row = Vec::with_capacity(ROWS);
+        let (last, round) = (self.row_count() - 1, self.columns);
+        let mut first_of_row = Vec::with_capacity(last + 1);
         for (row, ProfileRow { point, normal }) in self.profile.clone().into_iter().enumerate() {
             first_of_row.push(self.positions.len());
-            let columns = if row == 0 || row == last { 1 } else { COLUMNS };
+            let columns = if row == 0 || row == last { 1 } else { round };
             for column in 0..columns {
-                let angle = std::f64::consts::TAU * column as f64 / COLUMNS as f64;
+                let angle = std::f64::consts::TAU * column as f64 / round as f64;
                 let position = self.center + turned(point, angle);
                 self.positions.push(position.as_vec3().as_dvec3());
                 self.normals.push(turned(normal, angle));
@@ -101,11 +112,11 @@ impl Surface {
                 let around = if row == 0 || row == last {
                     0
                 } else {
-                    column % COLUMNS
+                    column % round
                 };
                 (first_of_row[row] + around) as u32
             };
-            for column in 0..COLUMNS {
+            for column in 0..round {
                 let (a, b) = (vertex(row, column), vertex(row, column + 1));
                 let (c, d) = (vertex(row + 1, column + 1), vertex(row + 1, column));
                 if row != 0 {
@@ -192,7 +203,7 @@ fn controls(shape: Shape) -> (Vec<DVec2>, Option<usize>) {
 }
 
 /// Spreads the rows along the curve; also the rim's row coordinate.
-fn rows_along(controls: &[DVec2], rim: Option<usize>) -> (Vec<ProfileRow>, f64) {
+fn rows_along(controls: &[DVec2], rim: Option<usize>, rows: usize) -> (Vec<ProfileRow>, f64) {
     // Mirrored across the axis, so that the curve meets it at a right angle.
     let mirrored = |p: DVec2| DVec2::new(-p.x, p.y);
     let mut extended = vec![mirrored(controls[1])];
@@ -224,10 +235,10 @@ fn rows_along(controls: &[DVec2], rim: Option<usize>) -> (Vec<ProfileRow>, f64) 
     }
     let total = measure[measure.len() - 1];
 
-    let mut profile = Vec::with_capacity(ROWS);
+    let mut profile = Vec::with_capacity(rows);
     let mut index = 0;
-    for row in 0..ROWS {
-        let wanted = total * row as f64 / (ROWS - 1) as f64;
+    for row in 0..rows {
+        let wanted = total * row as f64 / (rows - 1) as f64;
         while index + 2 < measure.len() && measure[index + 1] < wanted {
             index += 1;
         }
@@ -236,7 +247,7 @@ fn rows_along(controls: &[DVec2], rim: Option<usize>) -> (Vec<ProfileRow>, f64) 
         let mut point = fine[index].lerp(fine[index + 1], share);
         let direction = directions[index];
         let mut normal = DVec2::new(direction.y, -direction.x);
-        if row == 0 || row == ROWS - 1 {
+        if row == 0 || row == rows - 1 {
             point.x = 0.0;
             normal = DVec2::new(0.0, normal.y.signum());
         }
@@ -246,7 +257,7 @@ fn rows_along(controls: &[DVec2], rim: Option<usize>) -> (Vec<ProfileRow>, f64) 
         });
     }
     let rim_row = rim.map_or(f64::INFINITY, |rim| {
-        (ROWS - 1) as f64 * measure[rim * FINE] / total
+        (rows - 1) as f64 * measure[rim * FINE] / total
     });
     (profile, rim_row)
 }
@@ -274,8 +285,12 @@ mod tests {
 
     #[test]
     fn surfaces_are_closed_and_face_outwards() {
-        for shape in Shape::ALL {
-            let surface = Surface::new(shape);
+        let sizes = [(1, 4_000..6_000), (4096, 40_000..60_000)];
+        for (shape, (size, triangles)) in Shape::ALL
+            .into_iter()
+            .flat_map(|shape| sizes.clone().map(|size| (shape, size)))
+        {
+            let surface = Surface::new(shape, size);
             let mut volume = 0.0;
             let mut edges = std::collections::BTreeMap::new();
             for &[a, b, c] in &surface.triangles {
@@ -300,7 +315,7 @@ mod tests {
                 "{shape:?} has a boundary"
             );
             assert!(
-                (40_000..60_000).contains(&surface.triangles.len()),
+                triangles.contains(&surface.triangles.len()),
                 "{}",
                 surface.triangles.len()
             );

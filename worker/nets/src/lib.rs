@@ -10,6 +10,7 @@ pub mod composition;
 pub mod device;
 pub mod effects;
 pub mod losses;
+mod muon;
 pub mod optim;
 pub mod params;
 pub mod patchgan;

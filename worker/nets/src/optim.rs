@@ -1,18 +1,31 @@
-//! Adam (Kingma & Ba 2015) with an exponential moving average of the weights, on one flat buffer.
+//! Adam (Kingma & Ba 2015) and Muon (Jordan et al. 2024), with an exponential moving average of the weights, on one flat
+//! buffer.
 //!
 //! The paper uses Adam with a learning rate of 1e-3, beta1 = 0.9, beta2 = 0.999, epsilon = 1e-8 (Sec. "Training");
 //! those are the defaults here. A step whose gradient is not finite changes nothing and is counted.
 //!
+//! Deviation (presets `standard` and `auto`): matrices within both networks go along their [orthogonal] momentum, so that what
+//! the gradient rarely asks for is learned as fast as what it always does; everything else by Adam. Figures in
+//! worker/bake/README.md.
+//!
 //! On the CPU the buffer is updated piece by piece, so that each is in the cache for all of its operations: memory is read
 //! and written once a step, not once an operation.
+//!
+//! [orthogonal]: crate::muon
 
+use std::ops::Range;
+
+use crate::muon::{self, Matrix};
 use crate::params::{NetError, Params, flat_values};
 use rayon::prelude::*;
 use tch::{Device, Tensor, no_grad};
 
 /// Optimiser state for one [`Params`].
 #[derive(Debug)]
-pub struct Adam {
+pub struct Optimizer {
+    /// What goes along its orthogonal momentum, in order of offsets.
+    matrices: Vec<Matrix>,
+    /// Momentum where [`Self::matrices`] are.
     first: Tensor,
     second: Tensor,
     /// The weights themselves where averaging is off.
@@ -22,10 +35,10 @@ pub struct Adam {
     average_decay: f64,
 }
 
-/// What a checkpoint keeps of an [`Adam`].
+/// What a checkpoint keeps of an [`Optimizer`].
 #[derive(Clone, Debug)]
-pub struct AdamState {
-    /// First moments, [N].
+pub struct OptimizerState {
+    /// First moments and momentum, [N].
     pub first: Vec<f32>,
     /// Second moments, [N].
     pub second: Vec<f32>,
@@ -41,20 +54,26 @@ pub struct Trainee {
     /// The network's tensors.
     pub params: Params,
     /// Their optimiser.
-    pub adam: Adam,
+    pub optimizer: Optimizer,
 }
 
 impl Trainee {
-    /// A network at the start of its training; see [`Adam::new`].
+    /// A network at the start of its training by Adam; `average_decay` of 0 switches averaging off.
     pub fn new(params: Params, average_decay: f64) -> Self {
-        let adam = Adam::new(&params, average_decay);
-        Self { params, adam }
+        let optimizer = Optimizer::new(&params, average_decay, Vec::new());
+        Self { params, optimizer }
     }
 
-    /// One step down `loss`, a scalar that depends on the network's tensors; see [`Adam::step`].
+    /// The same, the matrices within the network by Muon.
+    pub fn with_muon(params: Params, average_decay: f64) -> Self {
+        let optimizer = Optimizer::new(&params, average_decay, muon::matrices(&params));
+        Self { params, optimizer }
+    }
+
+    /// One step down `loss`, a scalar that depends on the network's tensors; see [`Optimizer::step`].
     pub fn descend(&mut self, loss: &Tensor, rate: f64, max_norm: f64) -> bool {
         let gradient = self.params.gradient(loss);
-        self.adam.step(&self.params, &gradient, rate, max_norm)
+        self.optimizer.step(&self.params, &gradient, rate, max_norm)
     }
 }
 
@@ -64,10 +83,11 @@ const EPSILON: f64 = 1e-8;
 /// Values of a piece: below the number from which torch splits an operation between threads.
 const PIECE: i64 = 24_576;
 
-impl Adam {
-    /// Zero moments; the average starts at the present weights. `average_decay` of 0 switches averaging off.
-    pub fn new(params: &Params, average_decay: f64) -> Self {
+impl Optimizer {
+    /// Zero moments; the average starts at the present weights.
+    fn new(params: &Params, average_decay: f64, matrices: Vec<Matrix>) -> Self {
         Self {
+            matrices,
             first: params.flat().zeros_like(),
             second: params.flat().zeros_like(),
             average: if average_decay > 0.0 {
@@ -101,27 +121,51 @@ impl Adam {
             forget: 1.0 - self.average_decay.min((1.0 + steps) / (10.0 + steps)),
             averages: self.average_decay > 0.0,
         };
-        let length = match params.device() {
-            Device::Cpu => PIECE,
-            _ => params.flat().size()[0].max(1),
-        };
-        let mut buffers = [
-            gradient,
-            &self.first,
-            &self.second,
-            params.flat(),
-            &self.average,
-        ]
-        .map(|buffer| buffer.split(length, 0).into_iter());
-        let pieces: Vec<[Tensor; 5]> = std::iter::from_fn(|| {
-            let [a, b, c, d, e] = &mut buffers;
-            Some([a.next()?, b.next()?, c.next()?, d.next()?, e.next()?])
-        })
-        .collect();
+        let steps = muon::steps(&self.matrices, gradient, &self.first, update.shrink);
+        let mut pieces = Vec::new();
+        let mut from = 0;
+        for (matrix, step) in self.matrices.iter().zip(steps) {
+            self.split(params, gradient, from..matrix.offset, &mut pieces);
+            from = matrix.offset + matrix.len();
+            no_grad(|| {
+                let cut = |buffer: &Tensor| buffer.narrow(0, matrix.offset, matrix.len());
+                let mut weights = cut(params.flat());
+                weights -= step * rate;
+                update.average(&mut cut(&self.average), &weights);
+            });
+        }
+        self.split(params, gradient, from..gradient.size()[0], &mut pieces);
         pieces
             .into_par_iter()
             .for_each(|piece| no_grad(|| update.apply(piece)));
         true
+    }
+
+    /// Adds what Adam updates of a range, in pieces.
+    fn split(
+        &self,
+        params: &Params,
+        gradient: &Tensor,
+        range: Range<i64>,
+        pieces: &mut Vec<[Tensor; 5]>,
+    ) {
+        let piece = match params.device() {
+            Device::Cpu => PIECE,
+            _ => i64::MAX,
+        };
+        let mut from = range.start;
+        while from < range.end {
+            let length = piece.min(range.end - from);
+            let buffers = [
+                gradient,
+                &self.first,
+                &self.second,
+                params.flat(),
+                &self.average,
+            ];
+            pieces.push(buffers.map(|buffer| buffer.narrow(0, from, length)));
+            from += length;
+        }
     }
 
     /// The network with averaged weights.
@@ -135,8 +179,8 @@ impl Adam {
     }
 
     /// For a checkpoint.
-    pub fn state(&self) -> AdamState {
-        AdamState {
+    pub fn state(&self) -> OptimizerState {
+        OptimizerState {
             first: flat_values(&self.first),
             second: flat_values(&self.second),
             average: flat_values(&self.average),
@@ -148,7 +192,7 @@ impl Adam {
     ///
     /// # Errors
     /// A length that is not this network's.
-    pub fn restore(&mut self, state: &AdamState) -> Result<(), NetError> {
+    pub fn restore(&mut self, state: &OptimizerState) -> Result<(), NetError> {
         for (name, target, source) in [
             ("adam.first", &self.first, &state.first),
             ("adam.second", &self.second, &state.second),
@@ -197,8 +241,12 @@ impl Update {
         step = first / step;
         step *= self.rate;
         weights -= step;
+        self.average(&mut average, &weights);
+    }
+
+    fn average(&self, average: &mut Tensor, weights: &Tensor) {
         if self.averages {
-            drop(average.lerp_(&weights, self.forget));
+            drop(average.lerp_(weights, self.forget));
         }
     }
 }
@@ -215,7 +263,7 @@ mod tests {
         let mut builder = Builder::new();
         let id = builder.param("x", &[1], Init::Constant(1.0));
         let params = builder.build(Device::Cpu, 0);
-        let mut adam = Adam::new(&params, 0.0);
+        let mut adam = Optimizer::new(&params, 0.0, Vec::new());
         let (mut x, mut m, mut v) = (1.0f64, 0.0, 0.0);
         for t in 1..=5 {
             let gradient = params.gradient(&params.get(id).square().sum(Kind::Float));
@@ -235,7 +283,7 @@ mod tests {
         let mut builder = Builder::new();
         let id = builder.param("x", &[1], Init::Constant(0.0));
         let params = builder.build(Device::Cpu, 0);
-        let mut adam = Adam::new(&params, 0.9);
+        let mut adam = Optimizer::new(&params, 0.9, Vec::new());
         let gradient = params.gradient(&params.get(id).sqrt().sum(Kind::Float));
         assert!(!adam.step(&params, &gradient, 0.1, 1.0));
         assert_eq!(adam.skipped(), 1);

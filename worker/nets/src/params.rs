@@ -235,6 +235,18 @@ impl Params {
         self.flat.device()
     }
 
+    /// Offset and shape, [outputs, the rest], of what layers multiply by, but for what stays [exact](Builder::exact) and for
+    /// matrices with more outputs than inputs.
+    pub(crate) fn matrices(&self) -> Vec<(i64, [i64; 2])> {
+        let matrices = self.slots.iter().filter(|slot| {
+            let wide = |outputs: &i64| outputs * outputs <= slot.len();
+            slot.trainable && !slot.exact && slot.shape.len() >= 2 && wide(&slot.shape[0])
+        });
+        matrices
+            .map(|slot| (slot.offset, [slot.shape[0], slot.len() / slot.shape[0]]))
+            .collect()
+    }
+
     /// Number of trained values.
     pub fn count(&self) -> i64 {
         self.slots

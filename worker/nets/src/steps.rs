@@ -243,7 +243,7 @@ impl PointPairs {
 /// How a step of the standard networks goes down its loss.
 #[derive(Clone, Copy, Debug)]
 pub struct Descent {
-    /// Adam's learning rate.
+    /// Learning rate.
     pub rate: f64,
     /// What the layers compute in.
     pub kind: Kind,

@@ -48,7 +48,7 @@ use versions::{
     PublishAsk, find_version, insert_versions, lock_object, point_alias, point_latest,
     select_versions, set_retired,
 };
-use waiting::{Counted, all_queues, all_waiting, nothing};
+use waiting::{Counted, all_queues, all_waiting};
 use webhooks::announce;
 
 type DbRow = <Db as sqlx::Database>::Row;
@@ -342,7 +342,7 @@ impl Store for SqlStore {
 
     async fn all_waiting(&self, jobs: &[Job]) -> Result<Vec<Waiting>> {
         if jobs.iter().all(|job| job.state != JobState::Queued) {
-            return Ok(jobs.iter().map(|_| nothing()).collect());
+            return Ok(jobs.iter().map(|_| Waiting::default()).collect());
         }
         let mut reader = self.backend.reader().acquire().await?;
         let now = Backend::now(&mut reader).await?;

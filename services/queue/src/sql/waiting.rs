@@ -156,7 +156,7 @@ pub(super) async fn all_waiting(
     jobs.iter()
         .map(|job| {
             let Some(older) = older.get(&job.id) else {
-                return Ok(nothing());
+                return Ok(Waiting::default());
             };
             let name = &job.spec.object.collection;
             let own = queues.get(name).ok_or_else(|| missing_collection(name))?;
@@ -188,12 +188,4 @@ pub(super) async fn all_waiting(
             Ok(describe(job, &around))
         })
         .collect()
-}
-
-/// What a job that is not queued waits for.
-pub(super) fn nothing() -> Waiting {
-    Waiting {
-        position: 0,
-        reason: String::new(),
-    }
 }

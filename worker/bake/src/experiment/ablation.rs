@@ -33,7 +33,7 @@ const fn change(
     }
 }
 
-const CHANGES: [Change; 14] = [
+const CHANGES: [Change; 15] = [
     change("effects per surface point", "effects_net", "unet", "points"),
     change("effects only where they pay", "effects", "on", "auto"),
     change("blending head", "head", "paint", "blend"),
@@ -52,6 +52,7 @@ const CHANGES: [Change; 14] = [
         "pretrained",
     ),
     change("falling learning rate", "rate", "constant", "falling"),
+    change("Muon for matrices", "optimizer", "adam", "muon"),
     change("average of weights", "average_decay", "0", "0.995"),
     change("2 x 2 samples a pixel", "supersample", "1", "2"),
     change(

@@ -39,7 +39,7 @@ fn drift_in_exposure_costs_hardly_anything() {
     let capture = dir.path().join("capture");
     let options = DemoOptions {
         gloss: 0.2,
-        size: 64,
+        size: 96,
         views: 24,
         ..DemoOptions::default()
     };
