@@ -19,8 +19,8 @@ use crate::shape::Surface;
 use crate::trace::{Ray, Tracer};
 use crate::{DemoError, DemoOptions};
 
-/// Points of the sparse model: every n-th vertex of the mesh.
-const POINT_EVERY: usize = 23;
+/// Points of the sparse model, at least: every n-th vertex of the mesh.
+const POINTS: usize = 1100;
 
 /// A point is seen when nothing lies on the way to the eye, but for this part of it at the point.
 const LEAVE: f64 = 1e-3;
@@ -109,7 +109,8 @@ pub(crate) fn mesh(dir: &Path, surface: &Surface, colors: &[[u8; 3]]) -> Result<
 
 /// Indices of the sparse model's points among the vertices.
 fn points(surface: &Surface) -> Vec<usize> {
-    (0..surface.positions.len()).step_by(POINT_EVERY).collect()
+    let vertices = surface.positions.len();
+    (0..vertices).step_by((vertices / POINTS).max(1)).collect()
 }
 
 /// Per view, which of the sparse model's points it sees, and where.
