@@ -121,10 +121,10 @@ impl Optimizer {
             forget: 1.0 - self.average_decay.min((1.0 + steps) / (10.0 + steps)),
             averages: self.average_decay > 0.0,
         };
-        let steps = muon::steps(&self.matrices, gradient, &self.first, update.shrink);
+        let moves = muon::steps(&self.matrices, gradient, &self.first, update.shrink);
         let mut pieces = Vec::new();
         let mut from = 0;
-        for (matrix, step) in self.matrices.iter().zip(steps) {
+        for (matrix, step) in self.matrices.iter().zip(moves) {
             self.split(params, gradient, from..matrix.offset, &mut pieces);
             from = matrix.offset + matrix.len();
             no_grad(|| {
