@@ -1,15 +1,13 @@
 //! Muon (Jordan et al. 2024, "Muon: An optimizer for hidden layers in neural networks"): a step along the momentum of a matrix
 //! with all its singular values brought near to one.
 //!
-//! The kernel of a convolution counts as the matrix [outputs, inputs times taps]. The published iteration X <- (aI + bA + cA^2) X with
-//! A = X X^T changes X by factors of one symmetric matrix, which are multiplied first, so that the wide X is read twice and not
-//! ten times; matrices of as many outputs go through it together.
+//! The kernel of a convolution counts as the matrix [outputs, inputs times taps]. The published iteration
+//! X <- (aI + bA + cA^2) X with A = X X^T changes X by factors of one symmetric matrix, which are multiplied first, so that the
+//! wide X is read twice and not ten times; matrices of as many outputs go through it together.
 
 use std::collections::BTreeMap;
 
 use tch::{Kind, Tensor, no_grad};
-
-use crate::params::Params;
 
 /// Of Nesterov's momentum.
 const MOMENTUM: f64 = 0.95;
@@ -25,8 +23,8 @@ const LEAST_SQUARE: f64 = 1e-30;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Matrix {
     pub(crate) offset: i64,
-    /// Not more rows than columns.
-    shape: [i64; 2],
+    /// [outputs, the rest], not more rows than columns.
+    pub(crate) shape: [i64; 2],
 }
 
 impl Matrix {
@@ -37,14 +35,6 @@ impl Matrix {
     fn of(&self, buffer: &Tensor) -> Tensor {
         buffer.narrow(0, self.offset, self.len()).view(self.shape)
     }
-}
-
-/// A network's matrices, in order of their offsets.
-pub(crate) fn matrices(params: &Params) -> Vec<Matrix> {
-    let matrices = params.matrices().into_iter();
-    matrices
-        .map(|(offset, shape)| Matrix { offset, shape })
-        .collect()
 }
 
 /// Takes the gradient, times `shrink`, into each matrix's momentum; each matrix's step, flat, for a learning rate of 1.
@@ -181,7 +171,7 @@ mod tests {
         builder.param("bias", &[4], Init::Constant(0.0));
         builder.param("tall", &[4, 3], Init::Constant(0.0));
         let params = builder.build(Device::Cpu, 0);
-        let matrices = matrices(&params);
+        let matrices = params.matrices();
         assert_eq!(matrices.len(), 1, "the others are Adam's");
         for size in [0.0, 1e-30, 1e-12, 1e12] {
             tch::manual_seed(5);

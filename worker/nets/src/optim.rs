@@ -23,9 +23,9 @@ use tch::{Device, Tensor, no_grad};
 /// Optimiser state for one [`Params`].
 #[derive(Debug)]
 pub struct Optimizer {
-    /// What goes along its orthogonal momentum, in order of offsets.
+    /// What goes along its orthogonal momentum, in order of offsets; Adam's is the rest.
     matrices: Vec<Matrix>,
-    /// Momentum where [`Self::matrices`] are.
+    /// First moments, and momentum where [`Self::matrices`] are.
     first: Tensor,
     second: Tensor,
     /// The weights themselves where averaging is off.
@@ -66,7 +66,7 @@ impl Trainee {
 
     /// The same, the matrices within the network by Muon.
     pub fn with_muon(params: Params, average_decay: f64) -> Self {
-        let optimizer = Optimizer::new(&params, average_decay, muon::matrices(&params));
+        let optimizer = Optimizer::new(&params, average_decay, params.matrices());
         Self { params, optimizer }
     }
 
@@ -275,6 +275,42 @@ mod tests {
                 (m / (1.0 - 0.9f64.powi(t))) / ((v / (1.0 - 0.999f64.powi(t))).sqrt() + 1e-8);
             x -= 0.1 * step;
             assert!((params.get(id).double_value(&[0]) - x).abs() < 1e-5);
+        }
+    }
+
+    /// A matrix between two vectors: each by its own rule, all of them in the average.
+    #[test]
+    fn matrices_learn_by_muon_and_what_lies_between_them_by_adam() {
+        let parts = |trainee: &Trainee, buffer: &Tensor| {
+            assert_eq!(trainee.params.matrices().len(), 1);
+            buffer.split_with_sizes([3, 8, 3], 0)
+        };
+        let trained = |start: fn(Params, f64) -> Trainee| {
+            let mut builder = Builder::new();
+            builder.param("before", &[3], Init::Constant(1.0));
+            builder.param("matrix", &[2, 4], Init::Uniform(1.0));
+            builder.param("after", &[3], Init::Constant(1.0));
+            let mut trainee = start(builder.build(Device::Cpu, 1), 0.5);
+            for _ in 0..40 {
+                let gradient = trainee.params.flat() * 2.0;
+                let Trainee { params, optimizer } = &mut trainee;
+                assert!(optimizer.step(params, &gradient, 0.01, f64::INFINITY));
+            }
+            let weights = parts(&trainee, trainee.params.flat());
+            let average = parts(&trainee, &trainee.optimizer.average);
+            for (weights, average) in weights.iter().zip(&average) {
+                let apart = (weights - average).abs().max().double_value(&[]);
+                assert!(apart > 0.0 && apart < 0.05, "{apart}");
+            }
+            weights
+        };
+        let (adam, muon) = (trained(Trainee::new), trained(Trainee::with_muon));
+        assert_eq!(adam[0], muon[0]);
+        assert_eq!(adam[2], muon[2]);
+        assert_ne!(adam[1], muon[1]);
+        // Both go down: the loss is the square.
+        for weights in adam.iter().chain(&muon) {
+            assert!(weights.square().mean(Kind::Float).double_value(&[]) < 0.5);
         }
     }
 

@@ -4,6 +4,7 @@
 //! makes each tensor a leaf that shares its storage. The optimiser and the moving average then work on the buffer in
 //! one pass, and a checkpoint or a bundle file is a list of names, shapes and slices.
 
+use crate::muon::Matrix;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 use tch::{Device, Kind, Tensor, no_grad};
@@ -235,16 +236,18 @@ impl Params {
         self.flat.device()
     }
 
-    /// Offset and shape, [outputs, the rest], of what layers multiply by, but for what stays [exact](Builder::exact) and for
-    /// matrices with more outputs than inputs.
-    pub(crate) fn matrices(&self) -> Vec<(i64, [i64; 2])> {
-        let matrices = self.slots.iter().filter(|slot| {
-            let wide = |outputs: &i64| outputs * outputs <= slot.len();
-            slot.trainable && !slot.exact && slot.shape.len() >= 2 && wide(&slot.shape[0])
-        });
-        matrices
-            .map(|slot| (slot.offset, [slot.shape[0], slot.len() / slot.shape[0]]))
-            .collect()
+    /// What layers multiply by, in order of offsets, but for what stays [exact](Builder::exact) and for matrices with more
+    /// outputs than inputs.
+    pub(crate) fn matrices(&self) -> Vec<Matrix> {
+        let matrix = |slot: &Slot| {
+            let rows = *slot.shape.first()?;
+            let wide = slot.shape.len() >= 2 && rows * rows <= slot.len();
+            (wide && slot.trainable && !slot.exact).then(|| Matrix {
+                offset: slot.offset,
+                shape: [rows, slot.len() / rows],
+            })
+        };
+        self.slots.iter().filter_map(matrix).collect()
     }
 
     /// Number of trained values.
