@@ -215,7 +215,7 @@ async fn start_coordinator(
         // Asked to stop, or the service was dropped: both mean stop.
         let _either = stopped.await;
     };
-    Box::pin(ign_coordinator::serve(config, shutdown))
+    ign_coordinator::serve(config, shutdown)
         .await
         .map_err(|error| Problem::failed(chain(&error)).at(data.display()))
 }

@@ -14,6 +14,7 @@ use axum::http::header::{
     RANGE,
 };
 use axum::http::{HeaderMap, HeaderName, Method};
+use futures::future::BoxFuture;
 use ign_proto::v1::admin_server::AdminServer;
 use ign_proto::v1::bundles_server::BundlesServer;
 use ign_proto::v1::collections_server::CollectionsServer;
@@ -89,10 +90,23 @@ impl Running {
 
 /// Opens database and object store, listens, and serves in the background until `shutdown` is ready. Returns when
 /// requests are answered and the endpoint file is written.
-pub async fn serve(
+pub fn serve(
     config: Config,
     shutdown: impl Future<Output = ()> + Send + 'static,
-) -> Result<Running, ServeError> {
+) -> BoxFuture<'static, Result<Running, ServeError>> {
+    starting(config, Box::pin(shutdown))
+}
+
+/// Not generic, and boxed here: the server is compiled once, and not in every crate that starts one.
+#[inline(never)]
+fn starting(
+    config: Config,
+    shutdown: BoxFuture<'static, ()>,
+) -> BoxFuture<'static, Result<Running, ServeError>> {
+    Box::pin(start(config, shutdown))
+}
+
+async fn start(config: Config, shutdown: BoxFuture<'static, ()>) -> Result<Running, ServeError> {
     let doorkeeper = Doorkeeper::new(&config.token_file, &config.limits, config.behind_tls_proxy)?;
     let tls = config.tls.clone().map(Tls::load).transpose();
     let tls = tls

@@ -17,6 +17,7 @@ use tokio::task::JoinSet;
 use uuid::Uuid;
 
 use crate::changes::{Change, Signal};
+use crate::schema;
 use crate::store::{Result, Settings, StoreError};
 
 #[path = "sql/mod.rs"]
@@ -34,14 +35,6 @@ const MAX_CONNECTIONS: u32 = 24;
 const LOCK_TIMEOUT: &str = "10s";
 /// A coordinator that froze in the middle of a transaction lets go of its rows after this time.
 const IDLE_TRANSACTION_TIMEOUT: &str = "20s";
-
-/// What brings the schema up to date. One that is ahead, because a newer coordinator was here, is worked with: each step
-/// leaves the program before it working.
-fn migrations() -> sqlx::migrate::Migrator {
-    let mut migrations = sqlx::migrate!("../../migrations/postgres");
-    migrations.set_ignore_missing(true);
-    migrations
-}
 
 // What sql needs of its dialect.
 type Db = Postgres;
@@ -122,7 +115,7 @@ pub(crate) async fn open(url: &str, settings: Settings) -> Result<PostgresStore>
         .acquire_timeout(Duration::from_secs(10))
         .connect_with(options)
         .await?;
-    migrations()
+    schema::postgres()
         .run(&pool)
         .await
         .map_err(crate::error::from_migration)?;

@@ -18,6 +18,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, S
 use sqlx::{QueryBuilder, Sqlite, SqliteConnection, SqlitePool, Transaction};
 
 use crate::changes::Signal;
+use crate::schema;
 use crate::store::{Result, Settings, StoreError};
 
 #[path = "sql/mod.rs"]
@@ -30,14 +31,6 @@ mod sql;
 pub use sql::SqlStore as SqliteStore;
 
 const READERS: u32 = 4;
-
-/// What brings the schema up to date. One that is ahead, because a newer coordinator was here, is worked with: each step
-/// leaves the program before it working.
-fn migrations() -> sqlx::migrate::Migrator {
-    let mut migrations = sqlx::migrate!("../../migrations/sqlite");
-    migrations.set_ignore_missing(true);
-    migrations
-}
 
 // What sql needs of its dialect.
 type Db = Sqlite;
@@ -130,7 +123,7 @@ pub(crate) async fn open(url: &str, settings: Settings) -> Result<SqliteStore> {
             .max_lifetime(None)
     };
     let writer = pool(1).connect_with(options.clone()).await?;
-    migrations()
+    schema::sqlite()
         .run(&writer)
         .await
         .map_err(crate::error::from_migration)?;

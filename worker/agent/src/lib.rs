@@ -32,6 +32,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use futures::future::BoxFuture;
 use ign_proto::{Cause, WorkerId, v1};
 use reqwest::Url;
 use tokio_util::sync::CancellationToken;
@@ -130,7 +131,16 @@ struct Agent {
 ///
 /// # Errors
 /// The configuration is not usable, or the coordinator refuses the token.
-pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<(), AgentError> {
+#[inline(never)]
+pub fn run(
+    config: AgentConfig,
+    shutdown: CancellationToken,
+) -> BoxFuture<'static, Result<(), AgentError>> {
+    // Boxed, so that the agent is compiled here alone and not in every crate that runs one.
+    Box::pin(work(config, shutdown))
+}
+
+async fn work(config: AgentConfig, shutdown: CancellationToken) -> Result<(), AgentError> {
     let agent = Agent::prepare(config)?;
     tracing::info!(
         worker = %agent.worker,

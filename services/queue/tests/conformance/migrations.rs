@@ -1,12 +1,9 @@
 //! The schema goes up, down and up again, with data in it, and each step leaves the program before it working: a rolling
 //! upgrade runs both at once.
 
+use ign_queue::schema;
 use ign_testkit::Postgres;
 use sqlx::AssertSqlSafe;
-use sqlx::migrate::Migrator;
-
-static FOR_POSTGRES: Migrator = sqlx::migrate!("../../migrations/postgres");
-static FOR_SQLITE: Migrator = sqlx::migrate!("../../migrations/sqlite");
 
 /// The last step.
 const NEWEST: i64 = 24;
@@ -42,15 +39,15 @@ enum Database {
 impl Database {
     async fn up(&self, to: i64) {
         match self {
-            Self::Postgres(pool) => FOR_POSTGRES.run_to(to, pool).await.unwrap(),
-            Self::Sqlite(pool) => FOR_SQLITE.run_to(to, pool).await.unwrap(),
+            Self::Postgres(pool) => schema::postgres().run_to(to, pool).await.unwrap(),
+            Self::Sqlite(pool) => schema::sqlite().run_to(to, pool).await.unwrap(),
         }
     }
 
     async fn down(&self, to: i64) {
         match self {
-            Self::Postgres(pool) => FOR_POSTGRES.undo(pool, to).await.unwrap(),
-            Self::Sqlite(pool) => FOR_SQLITE.undo(pool, to).await.unwrap(),
+            Self::Postgres(pool) => schema::postgres().undo(pool, to).await.unwrap(),
+            Self::Sqlite(pool) => schema::sqlite().undo(pool, to).await.unwrap(),
         }
     }
 
