@@ -8,14 +8,24 @@ const EXPLODED: f64 = 10.0;
 const PATIENCE: u32 = 3;
 /// What the usual loss keeps of itself per step.
 const MEMORY: f64 = 0.9;
+/// Losses whose mean says what is usual. Before, since a stage may begin with samples that show next to nothing, only a loss
+/// that also goes on growing is suspicious.
+const ENOUGH: u32 = 10;
+/// Times the loss before it.
+const GROWING: f64 = 2.0;
 /// Losses below this are all the same: zero.
 const LEAST: f64 = 1e-6;
 
 /// Watches the losses of one training. Part of its checkpoints, so that a resumed training notices the same.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub(crate) struct Watchdog {
-    /// Moving average of the losses that were not suspicious.
-    usual: Option<f64>,
+    /// Mean of the losses that were not suspicious, of late.
+    mean: f64,
+    /// How many they were.
+    seen: u32,
+    /// The loss before.
+    last: f64,
     suspicious: u32,
 }
 
@@ -25,13 +35,16 @@ impl Watchdog {
         if !loss.is_finite() {
             return Some("the loss is not finite");
         }
-        let exploded = self
-            .usual
-            .is_some_and(|usual| loss > EXPLODED * usual.max(LEAST));
+        let settled = self.seen >= ENOUGH;
+        let exploded = self.seen > 0
+            && loss > EXPLODED * self.mean.max(LEAST)
+            && (settled || loss > GROWING * self.last);
+        self.last = loss;
         if applied && !exploded {
             self.suspicious = 0;
-            let usual = self.usual.unwrap_or(loss);
-            self.usual = Some(MEMORY * usual + (1.0 - MEMORY) * loss);
+            self.seen = self.seen.saturating_add(1);
+            let share = (1.0 - MEMORY).max(1.0 / f64::from(self.seen));
+            self.mean += share * (loss - self.mean);
             return None;
         }
         self.suspicious += 1;
@@ -91,6 +104,20 @@ mod tests {
         assert_eq!(noticed, Some(2));
         assert!(Watchdog::default().diverged(f64::NAN, true).is_some());
         assert!(Watchdog::default().diverged(f64::INFINITY, true).is_some());
+    }
+
+    /// The paper's pairs of views may begin with one that hardly overlaps.
+    #[test]
+    fn samples_that_show_next_to_nothing_at_the_start_make_no_divergence() {
+        let mut dog = Watchdog::default();
+        for loss in [1e-4, 0.05, 0.04, 0.07, 0.06, 2e-4, 0.05] {
+            assert_eq!(dog.diverged(loss, true), None, "{loss}");
+        }
+        for _ in 0..20 {
+            assert_eq!(dog.diverged(0.05, true), None);
+        }
+        let noticed = (0..5).position(|_| dog.diverged(5.0, true).is_some());
+        assert_eq!(noticed, Some(2));
     }
 
     #[test]
