@@ -60,8 +60,8 @@ impl App {
             .publish_and_complete(job, attempt, bundle)
             .await?;
         ign_faults::point("publish.committed");
-        let recorded = self.record(std::slice::from_ref(&version)).await;
-        self.retry_later(&version.object, recorded);
+        let recorded = self.registry.put_version(&record(&version)).await;
+        self.retry_later(&version.object, recorded.map_err(Refused::from));
         Ok(version)
     }
 
@@ -79,9 +79,9 @@ impl App {
         }
     }
 
-    async fn record(&self, versions: &[Version]) -> Result<(), Refused> {
+    async fn restore(&self, versions: &[Version]) -> Result<(), Refused> {
         for version in versions {
-            self.registry.put_version(&record(version)).await?;
+            self.registry.restore_version(&record(version)).await?;
         }
         Ok(())
     }
@@ -135,8 +135,8 @@ impl App {
         }
         stream::iter(objects)
             .for_each_concurrent(OBJECTS_IN_FLIGHT, |(object, versions)| async move {
-                let recorded = self.record(&versions).await;
-                self.retry_later(&object, recorded);
+                let restored = self.restore(&versions).await;
+                self.retry_later(&object, restored);
                 self.mirror(&object).await;
             })
             .await;

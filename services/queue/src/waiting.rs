@@ -77,6 +77,10 @@ fn reason(job: &Job, around: &Surroundings) -> String {
         );
     }
     match around.workers {
+        // As long as no worker is free, this is all there is to say.
+        1.. if position(around) == 0 => {
+            "it is next: the first worker that is free takes it".to_owned()
+        }
         0 => "no worker is connected".to_owned(),
         1 => "the worker has other jobs first".to_owned(),
         workers => format!("all {workers} workers have other jobs first"),

@@ -17,8 +17,8 @@ use chrono::{DateTime, Utc};
 use futures::{StreamExt as _, TryStreamExt as _};
 use ign_proto::manifest::{Kind, Manifest};
 use ign_proto::{Digest, JobId, LATEST, ObjectName};
-use object_store::ObjectStoreExt as _;
 use object_store::path::Path;
+use object_store::{ObjectStore as _, ObjectStoreExt as _, PutMode};
 use serde::{Deserialize, Serialize};
 
 use crate::error::{RegistryError, store_error};
@@ -108,10 +108,29 @@ impl Registry {
         self.path(&format!("versions/{object}/{name}"))
     }
 
-    /// Writes a version's record, unless it is there already.
+    /// Writes the record of a version that was made just now. On a store that refuses a second create this is one call.
     pub async fn put_version(&self, record: &VersionRecord) -> Result<(), RegistryError> {
-        let path = self.version_path(&record.object, &format!("v{}.json", record.version));
-        let bytes = to_json(&path, record)?;
+        if self.probe().conditional_create {
+            let (path, bytes) = self.encode_version(record)?;
+            let created = self
+                .records
+                .put_opts(&path, bytes.into(), PutMode::Create.into())
+                .await;
+            match created {
+                Ok(_) => {
+                    ign_faults::point("version.recorded");
+                    return Ok(());
+                }
+                Err(object_store::Error::AlreadyExists { .. }) => {}
+                Err(error) => return Err(store_error("write", &path)(error)),
+            }
+        }
+        self.restore_version(record).await
+    }
+
+    /// Writes a version's record where it is absent or rotten; most often it is there.
+    pub async fn restore_version(&self, record: &VersionRecord) -> Result<(), RegistryError> {
+        let (path, bytes) = self.encode_version(record)?;
         match self.read_small(&path).await? {
             Some(present) if present == bytes => return Ok(()),
             Some(present) if serde_json::from_slice::<VersionRecord>(&present).is_ok() => {
@@ -126,6 +145,12 @@ impl Registry {
         self.put_record(&path, bytes).await?;
         ign_faults::point("version.recorded");
         Ok(())
+    }
+
+    fn encode_version(&self, record: &VersionRecord) -> Result<(Path, Bytes), RegistryError> {
+        let path = self.version_path(&record.object, &format!("v{}.json", record.version));
+        let bytes = to_json(&path, record)?;
+        Ok((path, bytes))
     }
 
     async fn put_record(&self, path: &Path, bytes: Bytes) -> Result<(), RegistryError> {

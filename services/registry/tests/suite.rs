@@ -357,15 +357,18 @@ async fn versions_are_written_once_and_rebuilt(fixture: Fixture) {
     let (v1, v10) = (record(1), record(10));
     for record in [&v10, &v1, &v1] {
         registry.put_version(record).await.unwrap();
+        registry.restore_version(record).await.unwrap();
     }
     let other = VersionRecord {
         job_id: JobId::generate(),
         ..v1.clone()
     };
-    assert!(matches!(
+    for refused in [
         registry.put_version(&other).await,
-        Err(RegistryError::VersionTaken { .. })
-    ));
+        registry.restore_version(&other).await,
+    ] {
+        assert!(matches!(refused, Err(RegistryError::VersionTaken { .. })));
+    }
     let plain = ObjectState {
         newest: 10,
         aliases: [("latest".to_owned(), 10)].into(),

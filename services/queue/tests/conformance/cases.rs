@@ -1324,6 +1324,19 @@ pub(crate) async fn waiting_jobs_say_why(bench: &Bench) {
         (waiting.position, waiting.reason.as_str()),
         (1, "the worker has other jobs first")
     );
+    let next = Submit {
+        spec: JobSpec {
+            priority: 1,
+            ..spec("museum/jar")
+        },
+        ..request("museum/jar")
+    };
+    let next = bench.store.submit(next).await.unwrap();
+    let waiting = bench.store.waiting(&next).await.unwrap();
+    assert_eq!(
+        (waiting.position, waiting.reason.as_str()),
+        (0, "it is next: the first worker that is free takes it")
+    );
     let running = bench.store.get(urgent.id).await.unwrap();
     assert_eq!(bench.store.waiting(&running).await.unwrap().reason, "");
 }

@@ -143,10 +143,11 @@ fn a_bundle_that_cannot_be_so_small_is_refused_before_training() {
     }
 }
 
-/// In the mean of several seeds: two trainings that round differently go different ways, in either precision.
+/// In the median of several seeds: two trainings that round differently go different ways, in either precision, and end a tenth
+/// of a decibel apart, sometimes four.
 #[test]
 fn training_in_bfloat16_costs_no_twentieth_of_a_decibel() {
-    const SEEDS: u64 = 3;
+    const SEEDS: u64 = 9;
     let dir = tempfile::tempdir().expect("a folder");
     let dir = dir.path();
     let capture = capture(dir, 0.8);
@@ -166,11 +167,11 @@ fn training_in_bfloat16_costs_no_twentieth_of_a_decibel() {
         let metrics = metrics.expect("metrics").expect("metrics.json");
         metrics.method("ours").expect("a row").psnr
     };
-    let gains: Vec<f64> = (0..SEEDS)
+    let mut gains: Vec<f64> = (0..SEEDS)
         .map(|seed| psnr("bf16", seed) - psnr("fp32", seed))
         .collect();
-    let mean = gains.iter().sum::<f64>() / SEEDS as f64;
-    assert!(mean > -0.05, "{gains:?} dB");
+    gains.sort_by(f64::total_cmp);
+    assert!(gains[gains.len() / 2] > -0.05, "{gains:?} dB");
     // Not the same numbers: the setting does something.
     assert!(gains.iter().all(|gain| *gain != 0.0));
 }
