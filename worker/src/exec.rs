@@ -129,10 +129,7 @@ fn read_job(options: &Options) -> Result<BakeJob, Failure> {
         at: "recipe".to_owned(),
         hint: "see ignctl bake --help for presets and settings".to_owned(),
     })?;
-    // Torch sizes its own pool in the bake; the pool of rayon can be sized once, here.
-    rayon::ThreadPoolBuilder::new()
-        .num_threads(job.threads)
-        .build_global()
+    ign_nets::device::start_threads(job.threads)
         .map_err(|error| crashed(error.to_string(), String::new()))?;
     Ok(BakeJob {
         capture_dir: job.capture_dir,

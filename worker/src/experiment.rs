@@ -77,7 +77,7 @@ pub(crate) fn key_value(text: &str) -> Result<(String, String), String> {
 const INTERVAL: Duration = Duration::from_secs(10);
 
 pub(crate) fn run(options: &Options) -> Result<()> {
-    let threads = prepare(options.threads)?;
+    let threads = gpu::prepare(options.threads)?;
     let job = ExperimentJob {
         experiment: options.experiment,
         captures: options.captures.clone(),
@@ -129,17 +129,4 @@ pub(crate) fn explained(error: &BakeError) -> anyhow::Error {
         hint => format!("\nhint: {hint}"),
     };
     anyhow!("{}{hint}", failure.message)
-}
-
-/// Brings up the device and the threads; how many these are.
-pub(crate) fn prepare(threads: Option<NonZero<usize>>) -> Result<usize> {
-    gpu::enable()?;
-    let threads = match threads {
-        Some(threads) => threads.get(),
-        None => std::thread::available_parallelism()?.get(),
-    };
-    rayon::ThreadPoolBuilder::new()
-        .num_threads(threads)
-        .build_global()?;
-    Ok(threads)
 }

@@ -8,6 +8,7 @@
 
 use std::ffi::OsString;
 use std::io::Read;
+use std::num::NonZero;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -30,6 +31,17 @@ pub(crate) struct Gpu {
     /// For people: `NVIDIA H200`, `cpu`.
     pub(crate) name: String,
     pub(crate) envs: Vec<(OsString, OsString)>,
+}
+
+/// Brings up the device and the threads; how many these are.
+pub(crate) fn prepare(threads: Option<NonZero<usize>>) -> Result<usize> {
+    enable()?;
+    let threads = match threads {
+        Some(threads) => threads.get(),
+        None => std::thread::available_parallelism()?.get(),
+    };
+    ign_nets::device::start_threads(threads)?;
+    Ok(threads)
 }
 
 /// Settles the device for child processes of this one.

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use anyhow::Result;
 use ign_bake::{Crop, PretrainJob, Recipe, pretrain};
 
-use crate::experiment::{explained, key_value, prepare, said};
-use crate::output;
+use crate::experiment::{explained, key_value, said};
+use crate::{gpu, output};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Options {
@@ -32,7 +32,7 @@ pub(crate) struct Options {
 }
 
 pub(crate) fn run(options: &Options) -> Result<()> {
-    let threads = prepare(options.threads)?;
+    let threads = gpu::prepare(options.threads)?;
     let job = PretrainJob {
         captures: options.captures.clone(),
         recipe: Recipe {

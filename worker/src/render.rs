@@ -49,13 +49,7 @@ struct View {
 }
 
 pub(crate) fn run(options: &Options) -> Result<()> {
-    gpu::enable()?;
-    if let Some(threads) = options.threads {
-        ign_nets::device::limit_threads(threads.get());
-        rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.get())
-            .build_global()?;
-    }
+    gpu::prepare(options.threads)?;
     let renderer = BundleRenderer::open(&options.bundle, ign_nets::select_device())
         .with_context(|| format!("cannot open the bundle {}", options.bundle.display()))?;
     let views = views(options, &renderer)?;

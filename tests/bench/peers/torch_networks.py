@@ -23,9 +23,8 @@ sys.path.insert(0, os.path.join(ROOT, "worker", "nets", "tests", "paper"))
 
 from reference import PatchGan, UNet, cross_entropy  # noqa: E402
 
-RATE = 1e-3
-# Of the networks of preset `standard`: slow enough that both sides agree after many steps on random images.
-STANDARD_RATE = 1e-4
+# Slow enough that both sides agree after many steps on random images.
+RATE = 1e-4
 WARM_UP = 2
 BATCHES = 4
 
@@ -72,7 +71,7 @@ class Averaged:
 
         matrices = [weight for name, weight in named if wide(name, weight)]
         others = [weight for name, weight in named if not wide(name, weight)]
-        self.optimizers = [torch.optim.Adam(others, lr=STANDARD_RATE), Muon(matrices, lr=STANDARD_RATE)]
+        self.optimizers = [torch.optim.Adam(others, lr=RATE), Muon(matrices, lr=RATE)]
         self.steps = 0
         self.average = AveragedModel(network, multi_avg_fn=self.average_into)
         self.average.update_parameters(network)

@@ -40,8 +40,8 @@ const BATCHES: i64 = 4;
 const VIEWS: usize = 24;
 const RADIUS: f64 = 0.8;
 const WARM_UP: usize = 2;
-/// Slow enough that both sides agree after many steps on random images: at the paper's rate these go apart from rounding
-/// alone after about ten.
+/// Slow enough that both sides agree after many steps on random images: at the paper's rate, 1e-3, these go apart from
+/// rounding alone after about ten.
 const DESCENT: Descent = Descent {
     rate: 1e-4,
     kind: Kind::Float,
@@ -88,7 +88,7 @@ fn main() {
     );
     let variable = std::env::var("RAYON_NUM_THREADS").ok();
     let threads = variable.and_then(|text| text.parse().ok()).unwrap_or(1);
-    ign_nets::device::limit_threads(threads);
+    ign_nets::device::start_threads(threads).expect("nothing has run yet");
     tch::manual_seed(11);
     let mut inputs = Inputs(Vec::new());
     let mut once = match (net.as_str(), work.as_str()) {
@@ -157,7 +157,7 @@ fn train_paper_effects(inputs: &mut Inputs) -> Work {
             surface: &surface,
             taps: &taps,
         };
-        steps::effects_step(&net, &mut trainee, &pair, steps::RATE)
+        steps::effects_step(&net, &mut trainee, &pair, DESCENT.rate)
     })
 }
 
@@ -188,7 +188,7 @@ fn train_paper_composition(inputs: &mut Inputs) -> Work {
             truth: &truth,
             coverage: &coverage,
         };
-        gan.step(&mut painter, &mut critic, &example, steps::RATE)
+        gan.step(&mut painter, &mut critic, &example, DESCENT.rate)
     })
 }
 

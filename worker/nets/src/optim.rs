@@ -8,8 +8,9 @@
 //! the gradient rarely asks for is learned as fast as what it always does; everything else by Adam. Figures in
 //! worker/bake/README.md.
 //!
-//! On the CPU the buffer is updated piece by piece, so that each is in the cache for all of its operations: memory is read
-//! and written once a step, not once an operation.
+//! On the CPU the buffer is updated piece by piece, so that each is in the caches for all of its operations: memory is read
+//! and written once a step, not once an operation. Torch's own threads share a piece; other threads must not join in (see
+//! [`crate::device::start_threads`]).
 //!
 //! [orthogonal]: crate::muon
 
@@ -17,7 +18,6 @@ use std::ops::Range;
 
 use crate::muon::{self, Matrix};
 use crate::params::{NetError, Params, flat_values};
-use rayon::prelude::*;
 use tch::{Device, Tensor, no_grad};
 
 /// Optimiser state for one [`Params`].
@@ -80,7 +80,7 @@ impl Trainee {
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;
-/// Values of a piece: below the number from which torch splits an operation between threads.
+/// Values of a piece for each of torch's threads; two or more of these are as much as torch splits between them.
 const PIECE: i64 = 24_576;
 
 impl Optimizer {
@@ -122,10 +122,9 @@ impl Optimizer {
             averages: self.average_decay > 0.0,
         };
         let moves = muon::steps(&self.matrices, gradient, &self.first, update.shrink);
-        let mut pieces = Vec::new();
         let mut from = 0;
         for (matrix, step) in self.matrices.iter().zip(moves) {
-            self.split(params, gradient, from..matrix.offset, &mut pieces);
+            self.by_adam(params, gradient, from..matrix.offset, update);
             from = matrix.offset + matrix.len();
             no_grad(|| {
                 let cut = |buffer: &Tensor| buffer.narrow(0, matrix.offset, matrix.len());
@@ -134,23 +133,14 @@ impl Optimizer {
                 update.average(&mut cut(&self.average), &weights);
             });
         }
-        self.split(params, gradient, from..gradient.size()[0], &mut pieces);
-        pieces
-            .into_par_iter()
-            .for_each(|piece| no_grad(|| update.apply(piece)));
+        self.by_adam(params, gradient, from..gradient.size()[0], update);
         true
     }
 
-    /// Adds what Adam updates of a range, in pieces.
-    fn split(
-        &self,
-        params: &Params,
-        gradient: &Tensor,
-        range: Range<i64>,
-        pieces: &mut Vec<[Tensor; 5]>,
-    ) {
+    /// Updates a range by Adam.
+    fn by_adam(&self, params: &Params, gradient: &Tensor, range: Range<i64>, update: Update) {
         let piece = match params.device() {
-            Device::Cpu => PIECE,
+            Device::Cpu => PIECE * i64::from(tch::get_num_threads().max(1)),
             _ => i64::MAX,
         };
         let mut from = range.start;
@@ -163,7 +153,7 @@ impl Optimizer {
                 params.flat(),
                 &self.average,
             ];
-            pieces.push(buffers.map(|buffer| buffer.narrow(0, from, length)));
+            no_grad(|| update.apply(buffers.map(|buffer| buffer.narrow(0, from, length))));
             from += length;
         }
     }
