@@ -13,7 +13,7 @@ use tokio::time::Instant;
 
 use crate::Load;
 use crate::figures::{Figures, Target, say};
-use crate::service::{LEASE, Service};
+use crate::service::{LEASE, Service, Worker};
 
 /// Rows of one `SubmitBatch`: its answer, a job each, must fit into a message.
 const ROWS_A_CALL: usize = 10_000;
@@ -182,42 +182,69 @@ pub(crate) async fn status(
     Ok(())
 }
 
-/// Workers that lease and complete as fast as they can; cycles per second.
-pub(crate) async fn cycles(service: &Service, load: Load) -> Result<f64> {
-    let bundle = service
-        .upload("bench/o0", b"a bundle's only file\n")
-        .await?;
+/// What a worker does again and again.
+#[derive(Clone, Debug)]
+pub(crate) enum Cycle {
+    /// Leases a job and completes it with a bundle of this file.
+    Job(FileEntry),
+    /// Two calls that are refused as soon as they are read: what remains of a cycle without jobs.
+    Calls,
+}
+
+impl Cycle {
+    pub(crate) async fn job(service: &Service) -> Result<Self> {
+        let file = service
+            .upload("bench/o0", b"a bundle's only file\n")
+            .await?;
+        Ok(Self::Job(file))
+    }
+
+    async fn run(&self, worker: &mut Worker, name: &str) -> Result<()> {
+        let Self::Job(bundle) = self else {
+            refused_call(worker).await?;
+            return refused_call(worker).await;
+        };
+        let lease = worker.lease(lease_request(name, 5.0)).await?;
+        let lease = lease.into_inner().lease.context("the queue is empty")?;
+        // As real bundles do, each has a manifest of its own.
+        let file = FileEntry {
+            path: format!("{}.json", lease.job_id).parse()?,
+            ..bundle.clone()
+        };
+        worker
+            .complete(v1::CompleteRequest {
+                job: Some(attempt(&lease, name)),
+                files: vec![(&file).into()],
+                metrics_json: r#"{"mse":4.9}"#.to_owned(),
+            })
+            .await?;
+        Ok(())
+    }
+}
+
+async fn refused_call(worker: &mut Worker) -> Result<()> {
+    let answer = worker.heartbeat(v1::HeartbeatRequest::default()).await;
+    ensure!(answer.is_err(), "an empty report was taken");
+    Ok(())
+}
+
+/// Workers that do this as fast as they can; cycles per second.
+pub(crate) async fn cycles(service: &Service, load: Load, cycle: &Cycle) -> Result<f64> {
     let done = Arc::new(AtomicUsize::new(0));
     let mut workers = Vec::new();
     for number in 0..load.workers {
         let mut worker = service.worker()?;
         // The connection is made before the clock starts.
-        worker
-            .heartbeat(v1::HeartbeatRequest::default())
-            .await
-            .expect_err("an empty report is refused");
+        refused_call(&mut worker).await?;
         workers.push((format!("w{number}"), worker));
     }
     let begun = Instant::now();
     let until = begun + Duration::from_secs_f64(load.secs);
     let tasks = workers.into_iter().map(|(name, mut worker)| {
-        let (done, bundle) = (done.clone(), bundle.clone());
+        let (done, cycle) = (done.clone(), cycle.clone());
         tokio::spawn(async move {
             while Instant::now() < until {
-                let lease = worker.lease(lease_request(&name, 5.0)).await?;
-                let lease = lease.into_inner().lease.context("the queue is empty")?;
-                // As real bundles do, each has a manifest of its own.
-                let file = FileEntry {
-                    path: format!("{}.json", lease.job_id).parse()?,
-                    ..bundle.clone()
-                };
-                worker
-                    .complete(v1::CompleteRequest {
-                        job: Some(attempt(&lease, &name)),
-                        files: vec![(&file).into()],
-                        metrics_json: r#"{"mse":4.9}"#.to_owned(),
-                    })
-                    .await?;
+                cycle.run(&mut worker, &name).await?;
                 done.fetch_add(1, Ordering::Relaxed);
             }
             anyhow::Ok(())

@@ -15,6 +15,7 @@ use anyhow::{Context as _, Result};
 use ign_testkit::Postgres;
 
 use crate::figures::Figures;
+use crate::jobs::Cycle;
 use crate::service::Service;
 
 /// What to measure, and for how long.
@@ -77,17 +78,22 @@ async fn postgres(figures: &mut Figures, load: Load) -> Result<()> {
     let in_memory = Service::start_in_memory(&postgres.create_database()?).await?;
     jobs::fill(&in_memory, load.rows, "row").await?;
     let peer = pgbench::prepare(&postgres)?;
-    let (mut transactions, mut on_disk, mut without_disk) = (Vec::new(), Vec::new(), Vec::new());
+    let (disk_jobs, memory_jobs) = (Cycle::job(&service).await?, Cycle::job(&in_memory).await?);
+    let (mut transactions, mut on_disk) = (Vec::new(), Vec::new());
+    let (mut without_disk, mut calls_alone) = (Vec::new(), Vec::new());
     for _ in 0..load.rounds {
         transactions.push(pgbench::rate(&postgres, &peer, load.workers, load.secs)?);
-        on_disk.push(jobs::cycles(&service, load).await?);
-        without_disk.push(jobs::cycles(&in_memory, load).await?);
+        on_disk.push(jobs::cycles(&service, load, &disk_jobs).await?);
+        without_disk.push(jobs::cycles(&in_memory, load, &memory_jobs).await?);
+        calls_alone.push(jobs::cycles(&in_memory, load, &Cycle::Calls).await?);
     }
     let name = format!("lease and complete, {} workers, Postgres", load.workers);
     let peer = ("pgbench -N", &transactions[..]);
     figures.beside(&name, "cycles/s", &on_disk, peer, Some(0.5));
     let name = format!("{name}, bundles in memory");
     figures.beside(&name, "cycles/s", &without_disk, peer, None);
+    let name = format!("two calls that do nothing, {} workers", load.workers);
+    figures.beside(&name, "cycles/s", &calls_alone, peer, None);
     jobs::reports(figures, &service, "Postgres")
 }
 
@@ -99,9 +105,9 @@ async fn sqlite(figures: &mut Figures, load: Load) -> Result<()> {
     jobs::pickup(figures, &service, "SQLite").await?;
     jobs::submit(figures, &service, load, "SQLite").await?;
     jobs::status(figures, &service, load, "SQLite").await?;
-    let mut cycles = Vec::new();
+    let (jobs, mut cycles) = (Cycle::job(&service).await?, Vec::new());
     for _ in 0..load.rounds {
-        cycles.push(jobs::cycles(&service, load).await?);
+        cycles.push(jobs::cycles(&service, load, &jobs).await?);
     }
     figures.alone(
         &format!("lease and complete, {} workers, SQLite", load.workers),

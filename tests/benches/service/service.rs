@@ -39,6 +39,8 @@ impl Interceptor for Bearer {
 }
 
 type Authorized = InterceptedService<Channel, Bearer>;
+/// One worker's connection.
+pub(crate) type Worker = WorkersClient<Authorized>;
 
 /// A running coordinator whose store and token lie in a folder of its own.
 #[derive(Debug)]
@@ -139,7 +141,7 @@ impl Service {
     }
 
     /// A connection of its own for one worker.
-    pub(crate) fn worker(&self) -> Result<WorkersClient<Authorized>> {
+    pub(crate) fn worker(&self) -> Result<Worker> {
         Ok(WorkersClient::new(self.authorized()?))
     }
 
