@@ -3,6 +3,7 @@
 //! Both forms minimise the difference of two views' diffuse colours at the same surface point (`ign_nets::steps`); here is
 //! what they learn from.
 
+use ign_geometry::Camera;
 use ign_nets::effects::{PaperEffects, PointEffects};
 use ign_nets::optim::Trainee;
 use ign_nets::steps::{self, Descent, Observations, SiamesePair};
@@ -11,7 +12,7 @@ use ign_nets::{Builder, Params};
 use ign_render::{Effects, RenderSettings, Target};
 use rand::RngExt;
 use rayon::prelude::*;
-use tch::{Device, Kind, Tensor};
+use tch::{Kind, Tensor};
 
 use crate::BakeError;
 use crate::checkpoint::{Session, Stage, Watch};
@@ -55,143 +56,96 @@ fn views_that_fit(pixels: usize) -> usize {
     (MOST_SOURCE_BYTES / SOURCE_PIXEL_BYTES / pixels.max(1)).max(2)
 }
 
-/// Every surface point that one of these views sees.
+/// What a view saw of the surface: positions, normals and encoded sRGB, three values each.
+#[derive(Default)]
+struct Seen {
+    points: Vec<f32>,
+    normals: Vec<f32>,
+    colors: Vec<f32>,
+}
+
+/// Every surface point that one of these views sees. Each view's picture is written where it stays, in the corner of its
+/// place in the stack: there is no second copy of all of them.
 fn observe_all(data: &Dataset<'_>, views: &[usize]) -> Result<Observations, BakeError> {
-    struct One {
-        camera: ign_geometry::Camera,
-        points: Vec<f32>,
-        normals: Vec<f32>,
-        colors: Vec<f32>,
-        depth: Vec<f32>,
-        rgb: Vec<u8>,
-        alpha: Vec<u8>,
-    }
-    let per_view = MOST_OBSERVATIONS / views.len().max(1);
-    let views: Vec<One> = views
+    let own: Vec<Camera> = views
+        .iter()
+        .map(|&view| data.cameras(view, data.reference_scale).0)
+        .collect();
+    let longest = |side: fn(&Camera) -> u32| own.iter().map(side).max().unwrap_or(1);
+    let (width, height) = (
+        longest(|camera| camera.intrinsics.width),
+        longest(|camera| camera.intrinsics.height),
+    );
+    let place = width as usize * height as usize;
+    let mut depth = vec![0.0f32; place * views.len()];
+    let mut rgb = vec![0u8; place * views.len() * 3];
+    let mut alpha = vec![0u8; place * views.len()];
+    let per_view = (MOST_OBSERVATIONS / views.len().max(1)).max(1);
+    let seen: Vec<Seen> = views
         .par_iter()
-        .map(|&view| {
+        .zip(depth.par_chunks_mut(place))
+        .zip(rgb.par_chunks_mut(place * 3))
+        .zip(alpha.par_chunks_mut(place))
+        .map(|(((&view, depth), rgb), alpha)| {
             let straight = data.straight(view, data.reference_scale)?;
             let gbuffer = data.proxy.g_buffer(&straight.camera, 2);
-            let usable: Vec<usize> = (0..gbuffer.mask.len())
-                .filter(|&at| gbuffer.coverage[at] >= 1.0 && straight.alpha[at] >= 0.99)
-                .collect();
-            let stride = usable.len().div_ceil(per_view.max(1)).max(1);
-            let kept: Vec<usize> = usable.into_iter().step_by(stride).collect();
-            let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
-            Ok(One {
-                camera: straight.camera,
-                points: kept.iter().flat_map(|&at| gbuffer.position[at]).collect(),
-                normals: kept.iter().flat_map(|&at| gbuffer.normal[at]).collect(),
-                colors: kept
-                    .iter()
-                    .flat_map(|&at| {
-                        [
-                            straight.rgb[at * 3],
-                            straight.rgb[at * 3 + 1],
-                            straight.rgb[at * 3 + 2],
-                        ]
-                    })
-                    .collect(),
-                depth: gbuffer
-                    .depth
-                    .iter()
-                    .zip(&gbuffer.mask)
-                    .map(|(&d, &covered)| if covered { d } else { 0.0 })
-                    .collect(),
-                rgb: straight.rgb.iter().map(|&v| byte(v)).collect(),
-                alpha: straight.alpha.iter().map(|&v| byte(v)).collect(),
-            })
+            let own_width = straight.camera.intrinsics.width as usize;
+            let mut usable = Vec::new();
+            for at in 0..gbuffer.mask.len() {
+                let to = at / own_width * width as usize + at % own_width;
+                if gbuffer.mask[at] {
+                    depth[to] = gbuffer.depth[at];
+                }
+                for channel in 0..3 {
+                    rgb[to * 3 + channel] = byte(straight.rgb[at * 3 + channel]);
+                }
+                alpha[to] = byte(straight.alpha[at]);
+                if gbuffer.coverage[at] >= 1.0 && straight.alpha[at] >= 0.99 {
+                    usable.push(at);
+                }
+            }
+            let stride = usable.len().div_ceil(per_view).max(1);
+            let mut seen = Seen::default();
+            for at in usable.into_iter().step_by(stride) {
+                seen.points.extend(gbuffer.position[at]);
+                seen.normals.extend(gbuffer.normal[at]);
+                seen.colors.extend(&straight.rgb[at * 3..at * 3 + 3]);
+            }
+            Ok(seen)
         })
         .collect::<Result<_, BakeError>>()?;
-    let width = views
-        .iter()
-        .map(|v| v.camera.intrinsics.width)
-        .max()
-        .unwrap_or(1);
-    let height = views
-        .iter()
-        .map(|v| v.camera.intrinsics.height)
-        .max()
-        .unwrap_or(1);
-    let cameras: Vec<_> = views
-        .iter()
-        .map(|v| {
-            let mut camera = v.camera;
+    let cameras: Vec<Camera> = own
+        .into_iter()
+        .map(|mut camera| {
             (camera.intrinsics.width, camera.intrinsics.height) = (width, height);
             camera
         })
         .collect();
-    let depth: Vec<Vec<f32>> = views
-        .iter()
-        .map(|v| padded(&v.depth, v.camera.intrinsics.width, 1, (width, height)))
+    let index: Vec<i64> = (0..)
+        .zip(&seen)
+        .flat_map(|(view, seen)| std::iter::repeat_n(view, seen.points.len() / 3))
         .collect();
-    let depth: Vec<&[f32]> = depth.iter().map(Vec::as_slice).collect();
-    let stack = |pick: fn(&One) -> &Vec<f32>| {
-        Tensor::cat(
-            &views
-                .iter()
-                .map(|v| Tensor::from_slice(pick(v)).view([-1, 3]))
-                .collect::<Vec<_>>(),
-            0,
-        )
-        .to_device(data.device)
-    };
-    let index: Vec<Tensor> = views
-        .iter()
-        .enumerate()
-        .map(|(at, v)| {
-            Tensor::full(
-                [v.points.len() as i64 / 3],
-                at as i64,
-                (Kind::Int64, Device::Cpu),
-            )
-        })
-        .collect();
-    let rgb: Vec<Tensor> = views
-        .iter()
-        .map(|v| {
-            Tensor::from_slice(&padded(
-                &v.rgb,
-                v.camera.intrinsics.width,
-                3,
-                (width, height),
-            ))
+    let joined = |pick: fn(&Seen) -> &Vec<f32>| {
+        let values: Vec<&[f32]> = seen.iter().map(|it| pick(it).as_slice()).collect();
+        Tensor::from_slice(&values.concat())
             .view([-1, 3])
-        })
-        .collect();
-    let alpha: Vec<Tensor> = views
-        .iter()
-        .map(|v| {
-            Tensor::from_slice(&padded(
-                &v.alpha,
-                v.camera.intrinsics.width,
-                1,
-                (width, height),
-            ))
-        })
-        .collect();
+            .to_device(data.device)
+    };
     Ok(Observations {
-        points: stack(|v| &v.points),
-        normals: stack(|v| &v.normals),
-        colors: stack(|v| &v.colors),
-        views: Tensor::cat(&index, 0).to_device(data.device),
+        points: joined(|it| &it.points),
+        normals: joined(|it| &it.normals),
+        colors: joined(|it| &it.colors),
+        views: Tensor::from_slice(&index).to_device(data.device),
         sources: Sources::new(&cameras, &depth, data.device),
-        source_colors: Tensor::cat(&rgb, 0).to_device(data.device),
-        source_alpha: Tensor::cat(&alpha, 0).to_device(data.device),
+        source_colors: Tensor::from_slice(&rgb)
+            .view([-1, 3])
+            .to_device(data.device),
+        source_alpha: Tensor::from_slice(&alpha).to_device(data.device),
     })
 }
 
-/// Copies a row-major image of `channels` into the top-left corner of one of size `to`.
-fn padded<T: Copy + Default>(from: &[T], width: u32, channels: usize, to: (u32, u32)) -> Vec<T> {
-    let (from_row, to_row) = (width as usize * channels, to.0 as usize * channels);
-    let mut out = vec![T::default(); to_row * to.1 as usize];
-    for (source, target) in from
-        .chunks_exact(from_row.max(1))
-        .zip(out.chunks_exact_mut(to_row.max(1)))
-    {
-        target[..from_row].copy_from_slice(source);
-    }
-    out
+fn byte(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
 /// Trains the effects per surface point.
@@ -248,7 +202,7 @@ struct PaperView {
     mask: Tensor,
     /// [P] i64: pixels of `mask` that are 1.
     pixels: Tensor,
-    camera: ign_geometry::Camera,
+    camera: Camera,
     depth: Vec<f32>,
 }
 
@@ -303,7 +257,7 @@ pub(crate) fn train_paper(
         let p = &views[rng.random_range(0..views.len())];
         let q = &views[rng.random_range(0..views.len())];
         let map = p.geometry.view([9, -1]).tr().index_select(0, &p.pixels);
-        let sources = Sources::new(&[q.camera], &[q.depth.as_slice()], data.device);
+        let sources = Sources::new(&[q.camera], &q.depth, data.device);
         let points = map.narrow(1, 0, 3).contiguous();
         let normals = map.narrow(1, 3, 3).contiguous();
         let zeros = Tensor::zeros([points.size()[0]], (Kind::Int64, data.device));

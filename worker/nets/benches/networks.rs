@@ -321,7 +321,6 @@ fn observations(inputs: &mut Inputs) -> Observations {
     let lens = Tensor::from_slice(&lens).repeat([VIEWS as i64, 1]);
     drop(inputs.keep("intrinsics", lens));
     drop(inputs.keep("depth", Tensor::from_slice(&depth)));
-    let maps: Vec<&[f32]> = depth.chunks(depth.len() / VIEWS).collect();
     let points = Tensor::from_slice(&points).view([-1, 3]);
     let (count, pixels) = (points.size()[0], depth.len() as i64);
     let bytes = |shape: &[i64]| Tensor::randint(256, shape, (Kind::Uint8, Device::Cpu));
@@ -330,7 +329,7 @@ fn observations(inputs: &mut Inputs) -> Observations {
         points: inputs.keep("points", points),
         colors: inputs.uniform("colors", &[count, 3], 0.0, 1.0),
         views: inputs.keep("views", Tensor::from_slice(&views)),
-        sources: Sources::new(&cameras, &maps, Device::Cpu),
+        sources: Sources::new(&cameras, &depth, Device::Cpu),
         source_colors: inputs.keep("source_colors", bytes(&[pixels, 3])),
         source_alpha: inputs.keep(
             "source_alpha",

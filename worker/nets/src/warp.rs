@@ -53,8 +53,8 @@ pub struct Taps {
 }
 
 impl Sources {
-    /// `depth`: one camera-z map per camera, row-major, 0 where there is no surface; all cameras of one size.
-    pub fn new(cameras: &[Camera], depth: &[&[f32]], device: Device) -> Self {
+    /// `depth`: [V*H*W], a camera-z map per camera, 0 where there is no surface; all cameras of one size.
+    pub fn new(cameras: &[Camera], depth: &[f32], device: Device) -> Self {
         let (width, height) = cameras.first().map_or((0, 0), |c| {
             (
                 i64::from(c.intrinsics.width),
@@ -78,7 +78,6 @@ impl Sources {
             })
             .collect();
         let centers: Vec<f32> = cameras.iter().flat_map(|c| to_f32(c.center())).collect();
-        let flat: Vec<f32> = depth.concat();
         let views = cameras.len() as i64;
         Self {
             width,
@@ -92,7 +91,7 @@ impl Sources {
             centers: Tensor::from_slice(&centers)
                 .view([views, 3])
                 .to_device(device),
-            depth: Tensor::from_slice(&flat).to_device(device),
+            depth: Tensor::from_slice(depth).to_device(device),
         }
     }
 

@@ -143,8 +143,8 @@ fn taps() -> (Taps, i64) {
     };
     let (points, normals) = (pick(&target.position), pick(&target.normal));
     let view = Tensor::zeros([points.size()[0]], (Kind::Int64, Device::Cpu));
-    let taps = Sources::new(&[source.camera], &[source.depth.as_slice()], Device::Cpu)
-        .taps(&points, &normals, &view);
+    let taps =
+        Sources::new(&[source.camera], &source.depth, Device::Cpu).taps(&points, &normals, &view);
     let seen = taps.visibility.sum(Kind::Double).double_value(&[]);
     assert!(seen > 20.0 && seen < 0.95 * points.size()[0] as f64);
     (taps, 20 * 15)

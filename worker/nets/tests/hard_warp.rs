@@ -53,7 +53,7 @@ fn taps(source: &GBuffer, depth: &[f32], points: &[(DVec3, DVec3)]) -> Taps {
         Tensor::from_slice(&flat).view([-1, 3])
     };
     let view = Tensor::zeros([points.len() as i64], (Kind::Int64, Device::Cpu));
-    Sources::new(&[source.camera], &[depth], Device::Cpu).taps(
+    Sources::new(&[source.camera], depth, Device::Cpu).taps(
         &tensor(|point| point.0),
         &tensor(|point| point.1),
         &view,

@@ -82,7 +82,7 @@ fn colours_and_visibility_agree_with_the_reference_implementation() {
         Tensor::from_slice(&kept.iter().flat_map(|&at| values[at]).collect::<Vec<f32>>())
             .view([-1, 3])
     };
-    let sources = Sources::new(&[source.camera], &[source.depth.as_slice()], Device::Cpu);
+    let sources = Sources::new(&[source.camera], &source.depth, Device::Cpu);
     let view = Tensor::zeros([kept.len() as i64], (Kind::Int64, Device::Cpu));
     let taps = sources.taps(&pick(&target.position), &pick(&target.normal), &view);
     let image = Tensor::from_slice(&rgb).view([-1, 3]);
@@ -125,7 +125,7 @@ fn colours_and_visibility_agree_with_the_reference_implementation() {
 fn hard_points_stay_finite() {
     let mesh = mesh();
     let source = GBuffer::render(&mesh, &camera(DVec3::new(2.1, 0.9, 0.7), DVec3::Z), 1);
-    let sources = Sources::new(&[source.camera], &[source.depth.as_slice()], Device::Cpu);
+    let sources = Sources::new(&[source.camera], &source.depth, Device::Cpu);
     let eye = source.camera.center();
     let behind = eye * 2.0;
     let points: Vec<f32> = [

@@ -119,9 +119,8 @@ impl References {
                 camera
             })
             .collect();
-        let slices: Vec<&[f32]> = depths.iter().map(Vec::as_slice).collect();
         Self {
-            sources: Sources::new(&padded, &slices, device),
+            sources: Sources::new(&padded, &depths.concat(), device),
             colors: Tensor::cat(&colors, 0).to_device(device),
             alpha: Tensor::cat(&alphas, 0).to_device(device),
             geometry: Tensor::stack(&geometry, 0).to_device(device),

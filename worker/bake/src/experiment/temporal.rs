@@ -58,7 +58,7 @@ pub(super) fn residuals(bundle: &Bundle) -> Result<Vec<Step>, BakeError> {
             .map(|(&z, &covered)| if covered { z } else { 0.0 })
             .collect();
         let target = Target::new(&proxy, &now.camera, &settings, Device::Cpu);
-        let sources = Sources::new(&[before.camera], &[&depth], Device::Cpu);
+        let sources = Sources::new(&[before.camera], &depth, Device::Cpu);
         let points = target.points.size()[0];
         let first = Tensor::zeros([points], (Kind::Int64, Device::Cpu));
         let taps = sources.taps(&target.points, &target.normals, &first);
