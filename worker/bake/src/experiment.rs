@@ -264,10 +264,7 @@ impl Lab<'_> {
             ],
             rows,
             series: series.collect(),
-            x: Axis {
-                label: "training time",
-                unit: Unit::Seconds,
-            },
+            x: Axis::log("training time", Unit::Seconds),
             y: table::ERROR,
         })
     }
@@ -302,10 +299,7 @@ impl Lab<'_> {
             columns: &["without_effects", "with_effects", "ratio"],
             rows,
             series,
-            x: Axis {
-                label: "training time",
-                unit: Unit::Seconds,
-            },
+            x: Axis::log("training time", Unit::Seconds),
             y: table::ERROR,
         })
     }
@@ -335,14 +329,8 @@ impl Lab<'_> {
             columns: &["photograph", "estimated", "ratio"],
             rows,
             series,
-            x: Axis {
-                label: "error of the photograph",
-                unit: Unit::Plain,
-            },
-            y: Axis {
-                label: "error of the estimated diffuse image",
-                unit: Unit::Plain,
-            },
+            x: Axis::log("error of the photograph", Unit::Plain),
+            y: Axis::log("error of the estimated diffuse image", Unit::Plain),
         })
     }
 
@@ -384,10 +372,7 @@ impl Lab<'_> {
             columns: &["train_views", "ours", "pix2pix_position"],
             rows,
             series,
-            x: Axis {
-                label: "training views",
-                unit: Unit::Plain,
-            },
+            x: Axis::log("training views", Unit::Plain),
             y: table::ERROR,
         })
     }
@@ -428,10 +413,7 @@ impl Lab<'_> {
             columns: &["references", "k", "n_ibr", "ibr", "ours"],
             rows,
             series,
-            x: Axis {
-                label: "references, or K",
-                unit: Unit::Plain,
-            },
+            x: Axis::log("references, or K", Unit::Plain),
             y: table::ERROR,
         })
     }
@@ -472,14 +454,8 @@ impl Lab<'_> {
             columns: &["frames", "ours", "photographs", "ratio"],
             rows,
             series,
-            x: Axis {
-                label: "frame",
-                unit: Unit::Plain,
-            },
-            y: Axis {
-                label: "warp residual, 0 to 255",
-                unit: Unit::Plain,
-            },
+            x: Axis::even("frame"),
+            y: Axis::log("warp residual, 0 to 255", Unit::Plain),
         })
     }
 }

@@ -311,10 +311,7 @@ fn speed_section(metrics: &Metrics) -> String {
                 .collect()
         })
     };
-    let error = Axis {
-        label: "mean squared error, 0 to 255",
-        unit: plot::Unit::Plain,
-    };
+    let error = Axis::log("mean squared error, 0 to 255", plot::Unit::Plain);
     let (wide, small) = ((plot::WIDTH, 330.0), (430.0, 280.0));
     let panel = |size, series, x: Axis| {
         Plot {
@@ -331,26 +328,17 @@ fn speed_section(metrics: &Metrics) -> String {
         panel(
             wide,
             training,
-            Axis {
-                label: "training time",
-                unit: plot::Unit::Seconds
-            }
+            Axis::log("training time", plot::Unit::Seconds)
         ),
         panel(
             small,
             of_method(|m| m.render_ms),
-            Axis {
-                label: "milliseconds per frame",
-                unit: plot::Unit::Plain
-            }
+            Axis::log("milliseconds per frame", plot::Unit::Plain)
         ),
         panel(
             small,
             of_method(|m| m.bundle_bytes as f64),
-            Axis {
-                label: "bytes a viewer downloads",
-                unit: plot::Unit::Bytes
-            }
+            Axis::log("bytes a viewer downloads", plot::Unit::Bytes)
         ),
     )
 }

@@ -227,14 +227,8 @@ fn tabulated(subjects: &[Subject<'_>], changes: &[&Change], ratios: &[Vec<[Ratio
             Series::dots("ours", "standard without it", removed),
             Series::dots("paper", "the paper's with it", alone),
         ],
-        x: Axis {
-            label: "change",
-            unit: Unit::Plain,
-        },
-        y: Axis {
-            label: "error, as a ratio",
-            unit: Unit::Plain,
-        },
+        x: Axis::even("change"),
+        y: Axis::log("error, as a ratio", Unit::Plain),
     }
 }
 

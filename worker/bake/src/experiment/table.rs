@@ -9,10 +9,7 @@ use serde_json::{Map, Value, json};
 use crate::{BakeError, io};
 
 /// Axis of most plots.
-pub(super) const ERROR: Axis = Axis {
-    label: "mean squared error, 0 to 255",
-    unit: Unit::Plain,
-};
+pub(super) const ERROR: Axis = Axis::log("mean squared error, 0 to 255", Unit::Plain);
 
 /// One line: what it is about, then figures.
 #[derive(Clone, Debug, PartialEq)]

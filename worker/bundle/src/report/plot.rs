@@ -13,13 +13,38 @@ pub enum Unit {
     Bytes,
 }
 
-/// One axis, logarithmic.
+/// One axis.
 #[derive(Clone, Copy, Debug)]
 pub struct Axis {
-    /// What it measures.
-    pub label: &'static str,
-    /// In what.
-    pub unit: Unit,
+    label: &'static str,
+    unit: Unit,
+    spacing: Spacing,
+}
+
+impl Axis {
+    /// A logarithmic one: what it measures, and in what.
+    pub const fn log(label: &'static str, unit: Unit) -> Self {
+        Self {
+            label,
+            unit,
+            spacing: Spacing::Log,
+        }
+    }
+
+    /// One on which numbers follow each other evenly: frames of a path, say.
+    pub const fn even(label: &'static str) -> Self {
+        Self {
+            label,
+            unit: Unit::Plain,
+            spacing: Spacing::Even,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Spacing {
+    Log,
+    Even,
 }
 
 /// One method: a curve, a point, or (no training) a level.
@@ -65,7 +90,7 @@ impl Series {
     }
 }
 
-/// Error over a cost, both logarithmic.
+/// Error over a cost.
 #[derive(Clone, Debug)]
 pub struct Plot {
     /// Width and height of the drawing; the page scales it to the column.
@@ -86,8 +111,13 @@ const RIGHT: f64 = 152.0;
 const TOP: f64 = 26.0;
 const BOTTOM: f64 = 44.0;
 
-/// A logarithmic scale onto pixels.
+/// Dots that a curve has at most.
+const MOST_DOTS: usize = 60;
+
+/// From values to pixels.
 struct Scale {
+    spacing: Spacing,
+    /// Of the ends: values, or their decades.
     from: f64,
     to: f64,
     start: f64,
@@ -95,16 +125,22 @@ struct Scale {
 }
 
 impl Scale {
-    /// Covers `values` with a margin of a tenth of the decades, at least a fifth of a decade.
-    fn over(values: impl Iterator<Item = f64>, start: f64, end: f64) -> Option<Self> {
+    /// Covers `values` with a margin of a twelfth, at least a tenth of a decade. A logarithmic one shows positive values alone.
+    fn over(
+        spacing: Spacing,
+        values: impl Iterator<Item = f64>,
+        start: f64,
+        end: f64,
+    ) -> Option<Self> {
         let (low, high) = values
-            .filter(|v| *v > 0.0)
-            .map(f64::log10)
+            .filter(|v| matches!(spacing, Spacing::Even) || *v > 0.0)
+            .map(|v| spacing.place(v))
             .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
                 (low.min(v), high.max(v))
             });
         let margin = (0.08 * (high - low)).max(0.1);
         low.is_finite().then_some(Self {
+            spacing,
             from: low - margin,
             to: high + margin,
             start,
@@ -113,17 +149,26 @@ impl Scale {
     }
 
     fn at(&self, value: f64) -> f64 {
-        let share = (value.log10() - self.from) / (self.to - self.from);
+        let share = (self.spacing.place(value) - self.from) / (self.to - self.from);
         self.start + share.clamp(0.0, 1.0) * (self.end - self.start)
     }
 
-    /// 1, 2 and 5 times powers of ten; only 1 where the decades lie too close for labels between.
+    /// Round numbers, as many as have room for their labels.
     fn ticks(&self) -> Vec<f64> {
         // Labels need more room beside each other than above each other.
         let room = if self.end > self.start { 130.0 } else { 60.0 };
+        let length = (self.end - self.start).abs();
+        match self.spacing {
+            Spacing::Log => self.log_ticks(length / room),
+            Spacing::Even => self.even_ticks(2.0 * length / room),
+        }
+    }
+
+    /// 1, 2 and 5 times powers of ten; only 1 where the decades lie too close for labels between.
+    fn log_ticks(&self, roomy_decades: f64) -> Vec<f64> {
         let decades = self.to - self.from;
         let steps: &[f64] = match decades {
-            _ if (self.end - self.start).abs() < room * decades => &[1.0],
+            _ if roomy_decades < decades => &[1.0],
             _ if decades > 0.5 => &[1.0, 2.0, 5.0],
             _ => &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0],
         };
@@ -131,6 +176,29 @@ impl Scale {
             .flat_map(|exponent| steps.iter().map(move |step| step * 10_f64.powi(exponent)))
             .filter(|v| (self.from..=self.to).contains(&v.log10()))
             .collect()
+    }
+
+    /// Multiples of 1, 2 or 5 times a power of ten, at most so many.
+    fn even_ticks(&self, most: f64) -> Vec<f64> {
+        let least = (self.to - self.from) / most;
+        let power = 10_f64.powf(least.log10().floor());
+        let step = [1.0, 2.0, 5.0, 10.0]
+            .map(|it| it * power)
+            .into_iter()
+            .find(|step| *step >= least)
+            .unwrap_or(10.0 * power);
+        ((self.from / step).ceil() as i64..=(self.to / step).floor() as i64)
+            .map(|count| count as f64 * step)
+            .collect()
+    }
+}
+
+impl Spacing {
+    fn place(self, value: f64) -> f64 {
+        match self {
+            Self::Log => value.log10(),
+            Self::Even => value,
+        }
     }
 }
 
@@ -147,10 +215,12 @@ impl Plot {
     pub(super) fn svg(&self) -> String {
         let (width, height) = self.size;
         let points = || self.series.iter().flat_map(|s| &s.points);
-        let Some(y) = Scale::over(points().map(|p| p.1), height - BOTTOM, TOP) else {
+        let Some(y) = Scale::over(self.y.spacing, points().map(|p| p.1), height - BOTTOM, TOP)
+        else {
             return String::new();
         };
-        let Some(x) = Scale::over(points().map(|p| p.0), LEFT, width - RIGHT) else {
+        let Some(x) = Scale::over(self.x.spacing, points().map(|p| p.0), LEFT, width - RIGHT)
+        else {
             return String::new();
         };
         let (right, bottom) = (width - RIGHT, height - BOTTOM);
@@ -242,6 +312,7 @@ fn mark(series: &Series, x: &Scale, y: &Scale) -> String {
             if !series.joined {
                 return dots;
             }
+            let dots = if points.len() > MOST_DOTS { "" } else { &dots };
             format!(
                 "<polyline class=\"curve m-{}\" points=\"{}\"/>{dots}",
                 series.class,
@@ -314,7 +385,7 @@ pub(super) fn views(rows: &[ViewRow<'_>], label: &str) -> String {
         .iter()
         .flat_map(|r| [Some(r.ours), r.baseline])
         .flatten();
-    let Some(y) = Scale::over(errors, BOTTOM, TOP) else {
+    let Some(y) = Scale::over(Spacing::Log, errors, BOTTOM, TOP) else {
         return String::new();
     };
     let (left, right) = (LEFT, WIDTH - 20.0);
@@ -370,4 +441,34 @@ pub(super) fn views(rows: &[ViewRow<'_>], label: &str) -> String {
         "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{label}\">{grid}\
          <text class=\"axis\" x=\"{left}\" y=\"14\">mean squared error, 0 to 255</text>{marks}</svg>"
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scale(spacing: Spacing, values: &[f64]) -> Scale {
+        Scale::over(spacing, values.iter().copied(), 0.0, 400.0).unwrap()
+    }
+
+    #[test]
+    fn frames_follow_each_other_evenly_and_costs_by_their_decades() {
+        let frames = scale(Spacing::Even, &[0.0, 119.0]);
+        assert_eq!(frames.ticks(), [0.0, 50.0, 100.0]);
+        let step = frames.at(1.0) - frames.at(0.0);
+        assert!((frames.at(119.0) - frames.at(118.0) - step).abs() < 1e-9);
+        let costs = scale(Spacing::Log, &[0.0, 1.0, 1000.0]);
+        assert_eq!(costs.ticks(), [1.0, 10.0, 100.0, 1000.0]);
+        let decade = costs.at(10.0) - costs.at(1.0);
+        assert!((costs.at(1000.0) - costs.at(100.0) - decade).abs() < 1e-9);
+    }
+
+    #[test]
+    fn one_value_has_a_scale_and_none_has_not() {
+        for spacing in [Spacing::Even, Spacing::Log] {
+            assert!((scale(spacing, &[7.0]).at(7.0) - 200.0).abs() < 1e-9);
+            assert!(Scale::over(spacing, [].into_iter(), 0.0, 1.0).is_none());
+        }
+        assert!(Scale::over(Spacing::Log, [0.0].into_iter(), 0.0, 1.0).is_none());
+    }
 }
